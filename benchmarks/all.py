@@ -113,17 +113,10 @@ PARTS = {
     "damaged-files": Part("pytest", "tests/faults/test_damaged_files.py -m soak"),
     "client-faults": Part("pytest", "tests/clients/python/test_faults.py -m soak"),
     "takeover": Part("pytest", "tests/service/jobs/test_services.py -m thorough", "PostgreSQL"),
-    "cluster": Part("benchmarks.cluster.answers", "--datasets {data}", "data sets, PostgreSQL, scripts/cluster"),
-    "cluster-search": Part(
-        "benchmarks.cluster.search", "--datasets {data} --places 100000", "data sets, PostgreSQL, scripts/cluster"
-    ),
+    "milvus": Part("benchmarks.cluster.search", "--datasets {data} --places 100000", "data sets, .venv-cluster"),
     "engines": Part("benchmarks.cluster.engines", "--service", "PostgreSQL"),
     "sizing": Part("benchmarks.cluster.sizing", needs="PostgreSQL"),
     "kills": Part("tests.core.cluster.kills", "--kills 100", "PostgreSQL"),
-    "milvus-kills": Part("tests.core.cluster.kills", "--vectors milvus --kills 30", "PostgreSQL, .venv-cluster"),
-    "ray": Part("benchmarks.ray_serve.overhead", "--places 400 --robots 1 --robots 16", "placerec[ray]"),
-    "scaling": Part("benchmarks.ray_serve.scaling", "", "placerec[ray]"),
-    "ray-kills": Part("tests.service.ray_serve.kills", "--kills 12", "placerec[ray]"),
 }
 """The parts by name, accuracy first, then speed, then robustness and clusters."""
 

@@ -1,8 +1,8 @@
 """Switches that stop dependencies from reporting about this machine: variables that they read when they are imported.
 
-ONNX Runtime counts its runs, writes an identity of the machine and looks up the host that collects them; Ray reports
-the use of a cluster; FastAPI sends what OpenTelemetry's variables ask for.  Nothing leaves the machine but answers, so
-all of it is off in every process, whatever the environment says: SECURITY.md promises it.
+ONNX Runtime counts its runs, writes an identity of the machine and looks up the host that collects them; FastAPI sends
+what OpenTelemetry's variables ask for.  Nothing leaves the machine but answers, so all of it is off in every process,
+whatever the environment says: SECURITY.md promises it.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from collections.abc import MutableMapping
 
 SWITCHES = {
     "ORT_DISABLE_TELEMETRY": "1",
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_USAGE_STATS_REPORT_URL": "http://127.0.0.1:9",  # nobody listens: it reports even that it is not to report
     "FASTAPI_OTEL_AUTO_CONFIGURE": "false",
 }
 """Variables and the values that switch reports off.  ``docker/Dockerfile`` sets the same."""

@@ -70,30 +70,24 @@ class Settings(BaseSettings):
         "any number of services, such as postgresql://placerec:password@db/placerec; default: they are in the data "
         "directory of this one.",
     )
-    vectors: Literal["auto", "files", "postgres", "milvus"] = Field(
-        default="auto",
-        description="The engine that keeps the maps' descriptors and searches them: files in the data directory, "
-        "PostgreSQL with an index in the memory of each service, or PostgreSQL with Milvus; auto: files without a "
-        "database, else postgres.",
-    )
     row_cache_bytes: int = Field(
         default=256 << 20,
         ge=1 << 20,
-        description="With vectors in PostgreSQL: most bytes of descriptors, local descriptors and keypoints that were "
-        "read and are kept in memory.",
+        description="With a database: most bytes of descriptors, local descriptors and keypoints that were read and "
+        "are kept in memory.",
     )
     milvus: str | None = Field(
         default=None,
         pattern=r"^https?://[^\s/@]+/?$",
-        description="Address of Milvus, such as http://milvus:19530; https for TLS.",
+        description="Address of a Milvus that has an index of maps whose codes outgrow the memory of a service, such "
+        "as http://milvus:19530; https for TLS. Default: codes are in memory.",
     )
     milvus_token: SecretStr = Field(
         default=SecretStr(""), description="Token of Milvus, such as user:password; none by default."
     )
     milvus_certificate: Path | None = Field(
         default=None,
-        description="File with the certificate of the authority that Milvus's certificate is checked by; by default "
-        "by those that gRPC comes with.",
+        description="File with the certificate of the authority of Milvus's; default: those that gRPC comes with.",
     )
     milvus_database: str = Field(
         default="", max_length=255, description="Database of Milvus in which its collections are; its default if empty."
@@ -126,41 +120,6 @@ class Settings(BaseSettings):
         default=True,
         description="Before the service is ready, do once what requests do, so that no robot waits at its first frame. "
         "Without it a start is a second shorter.",
-    )
-    ray: bool = Field(
-        default=False,
-        description="Encode in processes of a Ray cluster, deployed with Ray Serve; needs the extra placerec[ray].",
-    )
-    ray_address: str = Field(
-        default="",
-        description="Address (host:port) of the Ray cluster to join; without one, a Ray is started on this machine, "
-        "for this service alone.",
-    )
-    ray_replicas: int = Field(default=1, ge=1, le=10_000, description="Fewest processes that encode.")
-    ray_max_replicas: int = Field(
-        default=0,
-        ge=0,
-        le=10_000,
-        description="Most processes that encode, while frames wait for those that run; 0: as many as the cluster has "
-        "room for when they are deployed.",
-    )
-    ray_replica_cpus: float = Field(
-        default=1.0, ge=0, le=1024, allow_inf_nan=False, description="Processors of one process that encodes."
-    )
-    ray_replica_gpus: float = Field(
-        default=0.0,
-        ge=0,
-        le=64,
-        allow_inf_nan=False,
-        description="GPUs of one process that encodes, or a share of one; it uses it if the device is cuda.",
-    )
-    ray_batch: int = Field(
-        default=8, ge=1, le=256, description="Most frames that are sent to such a process in one call."
-    )
-    ray_scale_seconds: Seconds = Field(
-        default=10.0,
-        description="Seconds for which frames have to wait before more processes are started; they are stopped after "
-        "twenty times as long.",
     )
     storage_threads: int = Field(
         default=8, ge=1, le=256, description="Searches, reads and writes of maps that run at the same time."
@@ -230,6 +189,14 @@ class Settings(BaseSettings):
     )
     max_stream_fragments: int = Field(
         default=1024, ge=1, le=1_000_000, description="Most fragments of one WebSocket message."
+    )
+    open_maps: int | None = Field(
+        default=None,
+        ge=1,
+        le=100_000,
+        description="Maps that are open at the same time; the one used least makes room, and is opened again when it "
+        "is used. Each takes 5 file descriptors and 0.7 MB besides what it holds for searching. Default: at most 256, "
+        "as many as the descriptors of the process and a 64th of the memory suffice for.",
     )
     max_maps: int = Field(default=1000, ge=1, le=100_000, description="Most maps of the data directory; then 409.")
     max_places: int = Field(default=10_000_000, ge=1, description="Most places of one map; then 409.")
@@ -367,21 +334,6 @@ class Settings(BaseSettings):
         if self.database is not None and not re.match(r"postgres(ql)?://|\w+ *=", self.database.get_secret_value()):
             raise ValueError(f"{PREFIX}DATABASE is not an address such as postgresql://placerec:password@db/placerec")
         return self
-
-    @model_validator(mode="after")
-    def _vectors_have_addresses(self) -> Settings:
-        if self.vectors in ("postgres", "milvus") and self.database is None:
-            raise ValueError(f"{PREFIX}VECTORS is {self.vectors}, which needs {PREFIX}DATABASE")
-        if self.vectors == "milvus" and self.milvus is None:
-            raise ValueError(f"{PREFIX}VECTORS is milvus, which needs {PREFIX}MILVUS")
-        return self
-
-    @property
-    def engine(self) -> Literal["files", "postgres", "milvus"]:
-        """The engine that keeps the maps' descriptors and searches them."""
-        if self.vectors != "auto":
-            return self.vectors
-        return "files" if self.database is None else "postgres"
 
     @property
     def models_directory(self) -> Path:

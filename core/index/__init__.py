@@ -9,9 +9,10 @@ Nothing here knows where descriptors or codes are stored.
 * :mod:`core.index.flat`: exact inner products with descriptors in memory, and rankings.
 * :mod:`core.index.codes`: :class:`Coder`, which makes of a descriptor one bit a value.
 * :mod:`core.index.table`: :class:`CodeTable`, the codes of a map, append-only, and the search over them.
+* :mod:`core.index.milvus`: the same in a Milvus, for maps whose codes do not fit in memory.
 """
 
 from core.index.codes import Coder, Codes
-from core.index.table import CodeTable
+from core.index.table import CodeTable, FirstStage
 
-__all__ = ["CodeTable", "Coder", "Codes"]
+__all__ = ["CodeTable", "Coder", "Codes", "FirstStage"]

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Protocol
 
 import faiss
 import numpy as np
@@ -106,6 +106,43 @@ class Shortlist(NamedTuple):
     estimates: Array
 
 
+class FirstStage(Protocol):
+    """Chooses, among rows 0 … n of a map, those whose descriptors are compared exactly.  An immutable value."""
+
+    def __len__(self) -> int:
+        """n; the rows behind them are compared by whoever asks."""
+
+    @property
+    def coder(self) -> Coder:
+        """Makes codes of descriptors."""
+
+    @property
+    def memory(self) -> int:
+        """Bytes in this process."""
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether nothing can be found in it any more, so that another has to be made."""
+
+    def appended(self, codes: Codes) -> FirstStage:
+        """With the codes of further rows, or, if they come into it in another way, as it is."""
+
+    def shortlists(
+        self, queries: Array, count: int, allowed: Flags | None = None, executor: Executor | None = None
+    ) -> list[Shortlist]:
+        """For each query the ``count`` rows with the highest estimates, fewer where there are not as many.
+
+        Args:
+            queries: float32 [B, D].
+            allowed: bool [n], which rows may be returned (living and chosen by a filter); None: all.
+            executor: may share the work; the calling thread takes part.  Not one whose threads call this.
+
+        Raises:
+            ValueError: ``allowed`` is not of one value a row, or the queries are of another length.
+            StoreUnavailable: a server that has the rows cannot be reached, refuses, or has lost them.
+        """
+
+
 @dataclass(frozen=True, eq=False)
 class CodeTable:
     """The codes of rows 0 … n of a map, an immutable value: appending gives a new one that shares its memory.
@@ -115,6 +152,7 @@ class CodeTable:
 
     coder: Coder
     blocks: tuple[Block, ...] = ()
+    is_lost: ClassVar[bool] = False
 
     @classmethod
     def empty(cls, coder: Coder) -> CodeTable:
@@ -155,16 +193,7 @@ class CodeTable:
     def shortlists(
         self, queries: Array, count: int, allowed: Flags | None = None, executor: Executor | None = None
     ) -> list[Shortlist]:
-        """For each query the ``count`` rows with the highest estimates, fewer where there are not as many.
-
-        Args:
-            queries: float32 [B, D].
-            allowed: bool [n], which rows may be returned (living and chosen by a filter); None: all.
-            executor: shares the work; the calling thread takes part.  Not one whose threads call this.
-
-        Raises:
-            ValueError: ``allowed`` is not of one value a row, or the queries are of another length.
-        """
+        """As of :class:`FirstStage`, with estimated inner products."""
         if allowed is not None and allowed.shape != (len(self),):
             raise ValueError(f"which rows are allowed is said of all {len(self)}")
         turned = self.coder.rotated(queries)

@@ -17,9 +17,9 @@ from psycopg_pool import ConnectionPool, PoolTimeout
 
 from core.errors import StorageFailure, StorageFull, StoreOfAnotherVersion, StoreUnavailable
 from core.ledger.database import Lock
-from core.ledger.outage import Outage, Unreachable
 from core.ledger.statements import Statement
 from core.ledger.tables import Tables
+from core.outage import Outage, Unreachable
 
 logging.getLogger("psycopg.pool").setLevel(logging.CRITICAL)  # it would log each attempt of an outage
 

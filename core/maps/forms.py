@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.index.flat import flat_index, products, vectors
+from core.index.flat import Vectors, flat_index, products, vectors
 from core.kernels.packed import packed_products
 from core.maps.records import MapRecord, Precision
 
@@ -193,6 +193,12 @@ class Form:
         """Descriptors, float32 [n, D], from their stored form."""
         rows = np.frombuffer(b"".join(stored), self._descriptor)["stored"]
         return unpack_descriptors(rows, self.precision, self.dimension)
+
+    def vectors(self, stored: Sequence[bytes]) -> Vectors:
+        """Descriptors as they are held in memory: float16 [n, D] where they are stored so, else float32."""
+        if self.precision != HALF:
+            return self.descriptors(stored)
+        return np.frombuffer(b"".join(stored), "<f2").reshape(len(stored), self.dimension)
 
     def inner_products(self, queries: NDArray[np.float32], stored: Sequence[bytes]) -> NDArray[np.float32]:
         """Inner products of queries, float32 [B, D], with descriptors in stored form: float32 [B, n]."""

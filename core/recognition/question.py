@@ -25,14 +25,12 @@ class Question:
     verify: when the geometry of the best candidates is verified.
     camera: the name of the map's camera that took the frame, whose mask is applied and whose intrinsics give the pose;
         None: not known.
-    explain: whether the score of the best match is to be explained, which needs the features of the frame's regions.
     """
 
     k: int = 5
     selection: Selection | None = None
     verify: Verify = "auto"
     camera: str | None = None
-    explain: bool = False
 
 
 class Reframing(Protocol):

@@ -24,6 +24,7 @@ from core.errors import (
     DataDirectoryTooOld,
     MapExists,
     MapQuarantined,
+    PlacerecError,
     StorageFailure,
     StorageFull,
     UnknownMap,
@@ -97,7 +98,7 @@ class Directory(Store):
         self._reserved: set[str] = set()
         # Maps that could not be read at the start, and why: damaged files, or errors of the disk.
         self._damaged: dict[str, str] = {}
-        self._refused: dict[str, str] = {}
+        self._refused: dict[str, PlacerecError] = {}
         self._closed = False
         with disk_errors(f"open the data directory {directory}"):
             make_folder(directory)
@@ -162,7 +163,7 @@ class Directory(Store):
         except (StorageFull, StorageFailure) as refusal:
             # The other maps are served; this one is tried again when it is used.
             log.error("Map %s cannot be opened: %s", folder.name, refusal)
-            self._refused[folder.name] = str(refusal)
+            self._refused[folder.name] = refusal
 
     def _make(self, made: MapRecord, unlisted: bool) -> Map:
         with self._making, disk_errors(f"create map {made.id!r}"):
@@ -301,14 +302,19 @@ class Directory(Store):
         Raises:
             UnknownMap, MapQuarantined, StorageFailure.
         """
-        found = self.find(map_id)
+        found = self._touched(self.find(map_id))
         found.open()
+        return found
+
+    def _touched(self, found: Map) -> Map:
+        assert isinstance(found.database, MapFile)
+        found.database.touch()
         return found
 
     def opened(self, map_id: str) -> Map | None:
         """A map that is in service and was read from disk before; None otherwise.  This never waits."""
         found = self._maps.get(map_id)
-        return found if found is not None and found.is_open else None
+        return self._touched(found) if found is not None and found.is_open else None
 
     def find(self, map_id: str) -> Map:
         """A map whose record and number of places can be used without reading it from disk.
@@ -327,9 +333,9 @@ class Directory(Store):
         found.expect_there()
         return found
 
-    def _absent(self, map_id: str) -> UnknownMap | MapQuarantined | StorageFailure:
-        if reason := self._refused.get(map_id):
-            return StorageFailure(reason)
+    def _absent(self, map_id: str) -> PlacerecError:
+        if refusal := self._refused.get(map_id):
+            return type(refusal)(*refusal.args)
         if reason := self._damaged.get(map_id):
             return MapQuarantined(f"Map {map_id!r} is damaged and out of service: {reason}.")
         return UnknownMap(f"There is no map {map_id[:80]!r}.")
@@ -351,7 +357,8 @@ class Directory(Store):
     def quarantined(self) -> dict[str, str]:
         in_use = {map_id: found.damage for map_id, found in self._maps.copy().items()}
         found_later = {map_id: reason for map_id, reason in in_use.items() if reason is not None}
-        return {**self._damaged, **self._refused, **found_later}
+        refused = {map_id: str(refusal) for map_id, refusal in self._refused.items()}
+        return {**self._damaged, **refused, **found_later}
 
     def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:
         with suppress(MapQuarantined):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from core.errors import StorageFailure
 from core.index import Coder, Codes, CodeTable
-from core.index.flat import flat_index, vectors
+from core.index.flat import Vectors, flat_index, vectors
 from core.ledger.maps import rows
 from core.ledger.maps.checksums import DamagedRow
 from core.ledger.maps.columns import Columns, read_columns
@@ -287,7 +287,7 @@ def _columns(connection: MapConnection, state: MapState, after: int | None = Non
 
 def _both(
     connection: MapConnection, record: MapRecord, first: int, offsets: NDArray[np.int64]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int8]]]:
+) -> Iterator[tuple[NDArray[np.int64], Vectors, NDArray[np.int8]]]:
     """Descriptors and local descriptors of rows, some at a time; rows that are gone are left out.
 
     Args:
@@ -301,7 +301,7 @@ def _both(
         if there:
             yield (
                 np.array(there, np.int64) - first,
-                form.descriptors([descriptors[row] for row in there]),
+                form.vectors([descriptors[row] for row in there]),
                 form.locals([local[row] for row in there]),
             )
 

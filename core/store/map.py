@@ -14,6 +14,7 @@ from core.geometry.keypoints import Keypoints, keypoints_of
 from core.index import Coder
 from core.ledger.maps import frames, places, record, rows
 from core.ledger.maps.archiving import Exporter
+from core.ledger.maps.checksums import DamagedRow
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.map import LedgerMap
 from core.ledger.maps.record import MapState
@@ -39,8 +40,8 @@ from core.store.recall import measure_recall
 from core.store.rows import RowCache
 from core.store.scopes import Chooser
 from core.store.snapshot import Scope, Snapshot
-from core.store.tiers import tier_for
-from core.store.verification import inspect
+from core.store.tiers import holds_for, tier_for
+from core.store.verification import damage_of_places, inspect
 
 log = logging.getLogger(__name__)
 
@@ -231,13 +232,33 @@ class Map(LedgerMap):
         """All places at this moment; later writes do not change the snapshot."""
         if (held := self._followed.as_of(self.latest())) is not None:
             return held.snapshot
+        self._expect_sound()
         with self.viewing() as (connection, state):
             return self._followed.up_to_date(connection, state).snapshot
+
+    def _expect_sound(self) -> None:
+        """Check the places of a small map in a file, and what they are found by, before it is read.
+
+        An SQLite file has no checksums of its own.  Of a larger map, rows are checked when they are read.
+        """
+        if self.database.shared or self._followed.held is not None:
+            return
+        with self.viewing() as (connection, state):
+            if not holds_for(state.record.index, state.searched, True):
+                return
+            if problem := next(damage_of_places(self.database, connection), None):
+                raise DamagedRow(problem)
+            stale = places.stale_tokens(connection)
+        if stale:  # it can be made again from the places, which are sound
+            log.warning("The index of the metadata of map %s is rebuilt: %s.", self.record.id, stale[0])
+            with self._transaction() as connection:
+                places.rebuild_tokens(connection)
 
     def scope(self, selection: Selection | None = None) -> Scope:
         """The places that a query may find at this moment; None: all."""
         if not selection:
             return Scope(self.snapshot())
+        self._expect_sound()
         with self.viewing() as (connection, state):
             return Chooser(self._followed.up_to_date(connection, state).snapshot, connection).scope(selection)
 

@@ -20,7 +20,6 @@ from service.access.keyring import Keyring
 from service.administration.audit_trail import AuditTrail
 from service.app.probe import Finding, Probe
 from service.backups.backups import Backups
-from service.engine.encoders import NO_ENCODER
 from service.engine.engine import Engine
 from service.errors.faults import KeysUnreadable, NotReady
 from service.jobs.job import Job
@@ -37,7 +36,6 @@ from service.places.plans import Plans
 from service.places.staging import Staging
 from service.queries.pictures import ExplanationPictures
 from service.queries.statistics import QueryStatistics
-from service.ray_serve import encoders_for
 from service.recordings import enrolling
 from service.recordings.readers import Readers
 from service.recordings.uploads import Recordings
@@ -123,7 +121,7 @@ class Runtime:
         with ExitStack() as opened:
             self.shared = None if database is None else _shared_state(settings, database)
             events = None if self.shared is None else self.shared.events
-            self.engine = Engine(settings, metrics, events, encoders_for(settings))
+            self.engine = Engine(settings, metrics, events)
             opened.callback(self.engine.close)
             self.jobs = _jobs(settings, self.engine) if self.shared is None else self.shared.jobs(self.engine.events)
             opened.callback(self.jobs.close, 0.0)
@@ -152,7 +150,7 @@ class Runtime:
         """Whether it has no room to write, as of the latest look."""
         self._noted = "the service is ready"
         maps, folder = self.engine.maps, partial(check_writable, settings.data_dir)
-        own = settings.engine == "files"
+        own = settings.database is None
         self._disk = Probe(maps.check_writable if own else folder, CHECK_SECONDS, "The disk does not answer.")
         self._database = None if own else Probe(maps.check_writable, CHECK_SECONDS, "PostgreSQL does not answer.")
         rooms = erasure.Rooms(self.engine, self.statistics, self.sessions, self.explanation_pictures, self.recordings)
@@ -265,7 +263,7 @@ class Runtime:
 
     async def check_readiness(self) -> Condition:
         """Check whether the service can answer queries, and take writes."""
-        checks = {"encoder": self._encoder()}
+        checks = {"encoder": Finding.of(self.engine.encoder_state, self.engine.public_encoder_state)}
         checks["maps"] = Finding() if self._database is None else await self._database.finding()
         checks["disk"] = await self._disk.finding()
         if self.shared is not None:
@@ -280,12 +278,6 @@ class Runtime:
         self._note_readiness(found)
         self.degraded = found.degraded is not None
         return found
-
-    def _encoder(self) -> Finding:
-        """The state of the default encoder, and of what computes it."""
-        if self.engine.encoder_state == "ok":
-            return Finding.of(self.engine.queue.encoders.state, NO_ENCODER)
-        return Finding(self.engine.encoder_state, self.engine.public_encoder_state)
 
     def _note_readiness(self, found: Condition) -> None:
         """Log when it becomes another one; that the encoder is being loaded is no news."""
@@ -314,4 +306,4 @@ def _jobs(settings: Settings, engine: Engine) -> Jobs:
 def _shared_state(settings: Settings, database: SharedDatabase) -> SharedState:
     from service.shared.state import SharedState  # with it comes what speaks to PostgreSQL
 
-    return SharedState(settings, database, shared_maps=settings.engine != "files")
+    return SharedState(settings, database, shared_maps=True)

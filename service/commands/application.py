@@ -14,7 +14,6 @@ from service.commands.laboratory import add_laboratory
 from service.commands.maps.backup import backup
 from service.commands.maps.maps import maps
 from service.commands.query import query
-from service.commands.ray import ray
 from service.commands.serve import serve
 from service.commands.settings import settings
 
@@ -32,5 +31,4 @@ application.add_typer(maps, name="maps")
 application.add_typer(backup, name="backup")
 application.add_typer(jobs, name="jobs")
 application.add_typer(keys, name="keys")
-application.add_typer(ray, name="ray")
 add_laboratory(application)

@@ -21,16 +21,13 @@ def serve(
         int | None, typer.Option(min=0, max=65535, help="Port; 0 takes a free one; default: PLACEREC_PORT.")
     ] = None,
     data_dir: Annotated[Path | None, typer.Option("--data-dir", help="Directory of the maps.")] = None,
-    ray: Annotated[
-        bool, typer.Option("--ray", help="Encode in processes of a Ray cluster, as PLACEREC_RAY=true does.")
-    ] = False,
 ) -> None:
     """Run the service in the foreground until it is interrupted or terminated.
 
     All other settings come from the environment; placerec settings lists them. Logs go to standard error, one JSON
     object a line.
     """
-    given = {"host": host, "port": port, "ray": ray or None}
+    given = {"host": host, "port": port}
     settings = read_settings(data_dir).model_copy(
         update={name: value for name, value in given.items() if value is not None}
     )
@@ -56,16 +53,15 @@ def _serve_logged(settings: Settings) -> None:
     from service.app.application import create_app
     from service.http.connections import Connections
     from service.http.server import CannotListen, serve_application
-    from service.ray_serve import check_usable
+    from service.open_files import raise_limit
     from service.settings import SettingsError
     from service.telemetry.requests import configure_logging
 
     gc.freeze()  # all of it lives as long as the process, so the garbage collector need not go through it
     gc.enable()
     configure_logging(settings.log_level)
+    raise_limit(settings)
     try:
-        if settings.ray:
-            check_usable(settings)
         application = create_app(settings)
     except SettingsError as error:
         raise Failure(str(error)) from error

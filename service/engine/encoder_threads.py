@@ -17,11 +17,12 @@ from core.errors import InvalidImage
 from core.frames.images import Limits, decode
 from core.frames.masks import Mask, range_in
 from core.frames.preprocessing import Pixels
+from core.frames.value_ranges import few_values
 from core.geometry.detection import ScaledFrame, keypoints_in
 from core.geometry.keypoints import Keypoints
 from core.networks.xfeat import packaged_xfeat
 from core.threads import allowed_threads, begun, cores, keep_to, processors, use_threads
-from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded, narrow_values
+from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
 from service.errors.faults import DeadlineExceeded
 
 MOST_PIXELS = 40_000_000
@@ -31,7 +32,7 @@ FEW_PIXELS = 2_000_000
 """Frames of so many pixels are not counted among those, so that they need not wait for the end of a large one."""
 
 AHEAD = 8 * max(2, cores())
-"""Frames of one bulk request that wait at a time."""
+"""Frames of one bulk request that wait at a time: enough that the threads never run out of them."""
 
 log = logging.getLogger("placerec.inference")
 
@@ -56,16 +57,6 @@ class EncoderThreads:
         ]
         for thread in self._threads:
             thread.start()
-
-    @property
-    def ahead(self) -> int:
-        """Frames of one bulk request that wait at a time."""
-        return AHEAD
-
-    @property
-    def state(self) -> str:
-        """Always "ok": threads are there as long as their process."""
-        return "ok"
 
     def close(self) -> None:
         """Cancel all waiting frames, and end the threads once they have finished theirs."""
@@ -139,12 +130,13 @@ class EncoderThreads:
             spent: dict[str, float] = {}  # by another thread, which may end after a frame without regions is done
             find = begun(lambda: _keypoints(pixels, frame.mask, spent)) if frame.keypoints else None
             encoding = frame.encoder.encode(pixels, frame.mask)
-            if not frame.features:
+            if frame.bulk:
                 encoding = replace(encoding, regions=encoding.regions.without_features())
             if not len(encoding.regions):
                 find = None
             times |= encoding.milliseconds
-            few = narrow_values(frame, encoding)
+            seen = len(encoding.regions) or range_in(frame.mask) is not None
+            few = None if seen else few_values(frame.data)
             encoded = Encoded(pixels, encoding, frame.encoder, times, frame.mask, begun=find, few_values=few)
             if frame.after_encoding is not None:
                 with suppress(Exception):  # Searches repeats the search and reports the error

@@ -1,25 +1,22 @@
-"""The interface between the queue and the encoders: threads of this process, or processes of a cluster.
-
-A frame waits in :class:`WaitingFrames` and becomes an :class:`Encoded`; :class:`Encoders` encode it.
+"""The frames between the queue and the threads that encode: each waits in :class:`WaitingFrames` until one takes it,
+and becomes an :class:`Encoded`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from core.frames.containers import read_header
-from core.frames.images import Limits
-from core.frames.masks import Mask, range_in
+from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
-from core.frames.value_ranges import ValueRange, few_values
+from core.frames.value_ranges import ValueRange
 from core.geometry.detection import ScaledFrame, keypoints_in
 from core.geometry.keypoints import Keypoints
 from core.method.encoder import Encoder, Encoding
@@ -28,7 +25,6 @@ from core.recognition.framings import FrameReframing
 from core.recognition.question import Query, Question
 from service.errors.faults import DeadlineExceeded
 from service.fairness import CALLER, FairQueue
-from service.telemetry.metrics import Metrics
 
 BULK_SHARE = 4
 """One frame in this many is a bulk frame while robots' frames wait, or bulk would wait as long as robots send."""
@@ -41,8 +37,8 @@ ENCODING_MILLISECONDS, MEGAPIXEL_MILLISECONDS = 20.0, 10.0
 class Encoded:
     """A frame, decoded and encoded.
 
-    source: its pixels, or a function that decodes them when first needed, where another process has encoded it.
-    encoding: its regions have features only if these were requested.
+    pixels: uint8 [H, W, 3], BGR.
+    encoding: the regions of a bulk frame, which nobody explains, have no features.
     encoder: the encoder that has encoded it.
     milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward``, ``regions``, ``vlad`` and ``keypoints``.
     mask: the part of the frame that was ignored.
@@ -52,7 +48,7 @@ class Encoded:
     search_result: what the frame's ``after_encoding`` returned for it; None if it had none, or that failed.
     """
 
-    source: Pixels | Callable[[], Pixels]
+    pixels: Pixels
     encoding: Encoding
     encoder: Encoder
     milliseconds: dict[str, float]
@@ -62,11 +58,6 @@ class Encoded:
     begun: Callable[[], Keypoints] | None = None
     few_values: ValueRange | None = None
     _scaled: ScaledFrame | None = None
-
-    @cached_property
-    def pixels(self) -> Pixels:
-        """Uint8 [H, W, 3], BGR."""
-        return self.source() if callable(self.source) else self.source
 
     @property
     def scaled(self) -> ScaledFrame:
@@ -90,12 +81,7 @@ class Encoded:
             keep_scaled: retain the scaled pixels in which keypoints are found, at most 0.3 MB.
         """
         scaled = self.scaled if keep_scaled else None
-        return replace(self, source=np.zeros((0, 0, 3), np.uint8), begun=None, _scaled=scaled)
-
-
-def narrow_values(frame: QueuedFrame, encoding: Encoding) -> ValueRange | None:
-    """The ``few_values`` of an encoded frame."""
-    return None if len(encoding.regions) or range_in(frame.mask) is not None else few_values(frame.data)
+        return replace(self, pixels=np.zeros((0, 0, 3), np.uint8), begun=None, _scaled=scaled)
 
 
 AfterEncoding = Callable[[Encoded], object]
@@ -111,12 +97,10 @@ class QueuedFrame:
     deadline: the ``time.monotonic`` after which its encoding is not begun any more.
     bulk: whether its request has many frames; such a frame may wait longer than the single frame of a robot.
     keypoints: whether the frame's keypoints are wanted, too.
-    features: whether the features of its regions are, which only explanations need.
     after_encoding: is called in the encoder's thread: a search done there needs no change of threads.  It must take
         only milliseconds.
     result: the encoded frame, or the error that prevented its encoding.
     caller: the caller whose turn it takes.
-    attempts: how often its encoding was begun and lost, because the process that had it ended.
     queued: the ``time.perf_counter`` at which the frame began to wait.
     pixels: the number of pixels by the header of the file, or 0 if that cannot be read.
     """
@@ -127,9 +111,7 @@ class QueuedFrame:
     deadline: float
     bulk: bool = False
     keypoints: bool = False
-    features: bool = False
     after_encoding: AfterEncoding | None = None
-    attempts: int = 0
     caller: str = field(default_factory=CALLER.get)
     result: Future[Encoded] = field(default_factory=Future)
     queued: float = field(default_factory=time.perf_counter)
@@ -192,35 +174,6 @@ class WaitingFrames:
         """The queue whose turn it is."""
         bulk_next = not self._robots or (self._bulk and self._passed_over >= BULK_SHARE - 1)
         return self._bulk if bulk_next else self._robots
-
-
-class Encoders(Protocol):
-    """The encoders of the frames that a queue has let in.  Thread-safe.
-
-    A frame that cannot be encoded fails alone, by the error of its ``result``.  One whose ``result`` is cancelled
-    before its encoding has begun is not encoded, nor is one whose deadline has passed.
-    """
-
-    @property
-    def ahead(self) -> int:
-        """Frames of one bulk request that wait at a time: enough that the encoders never run out of them."""
-
-    @property
-    def state(self) -> str:
-        """ "ok", or a sentence that says why no frame is encoded now."""
-
-    def put(self, frames: Iterable[QueuedFrame]) -> None:
-        """Add frames; returns at once."""
-
-    def close(self) -> None:
-        """Cancel all waiting frames and end; blocks."""
-
-
-NO_ENCODER = "No frame can be encoded now; the log of the service says why."
-"""The text of a state that is not "ok" for those who may not know the addresses of an installation."""
-
-MakeEncoders = Callable[[Limits, Metrics], Encoders]
-"""Makes the encoders, given the largest frame that is decoded and where to count."""
 
 
 def deadline_exceeded() -> DeadlineExceeded:

@@ -31,7 +31,7 @@ from core.networks.xfeat import packaged_xfeat
 from core.recognition.question import Question
 from core.recognition.recognition import needs_keypoints
 from core.store import Map, Store
-from service.engine.encoders import Encoded, MakeEncoders
+from service.engine.encoders import Encoded
 from service.engine.queue import EncoderQueue, RequestDeadline
 from service.engine.rehearsal import rehearse
 from service.engine.review_keeper import ReviewKeeper
@@ -94,31 +94,19 @@ class Engine:
 
     Jobs, sessions, imports and all other capabilities are built on an engine, which imports none of them.
 
-    Args:
-        make_encoders: makes the encoders; None: threads of this process.
-
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
         MissingExtra: the store of the settings needs a package that is not installed.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        metrics: Metrics,
-        events: Events | None = None,
-        make_encoders: MakeEncoders | None = None,
-    ) -> None:
+    def __init__(self, settings: Settings, metrics: Metrics, events: Events | None = None) -> None:
         self.settings, self.metrics = settings, metrics
         self._store = OpenStore(settings)
         self.maps: Store = self._store.maps
-        # Where others make the encodings, an encoder here compares descriptors and computes no forward pass.
-        device = settings.device if make_encoders is None else "cpu"
-        self.catalogue = EncoderCatalogue(settings.models_directory, device)
+        self.most_open_maps = self._store.most_open
+        self.catalogue = EncoderCatalogue(settings.models_directory, settings.device)
         limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
-        self.queue = EncoderQueue(
-            self.catalogue, limits, settings.queue_length, settings.threads, metrics, make_encoders
-        )
+        self.queue = EncoderQueue(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
         self.searches = Searches()
         self.events = Events(settings.event_listeners) if events is None else events
         self.review_keeper = ReviewKeeper()
@@ -251,8 +239,8 @@ class Engine:
         mask = await camera_mask(map_, question.camera)
         ahead = search_ahead(map_, question)
         with self.queue.place():
-            wanted = needs_keypoints(map_, question), question.explain
-            frame = await self.queue.encode(map_.record.encoder, data, deadline, mask, ahead, *wanted)
+            keypoints = needs_keypoints(map_, question)
+            frame = await self.queue.encode(map_.record.encoder, data, deadline, mask, ahead, keypoints)
         (answered,) = await self.searches.answer(map_, [frame], question)
         return answered
 

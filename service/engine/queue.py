@@ -17,8 +17,8 @@ from core.frames.masks import Mask
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.threads import cores, share_cores
-from service.engine.encoder_threads import EncoderThreads
-from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders, QueuedFrame, deadline_exceeded
+from service.engine.encoder_threads import AHEAD, EncoderThreads
+from service.engine.encoders import AfterEncoding, Encoded, QueuedFrame, deadline_exceeded
 from service.errors.faults import ClientGone, DeadlineExceeded, EncoderNotInstalled, QueueFull
 from service.fairness import Holding, SharedRoom
 from service.telemetry.metrics import Metrics
@@ -94,23 +94,16 @@ class EncoderQueue:
         queue_length: the most requests that may have a place at one time.
         threads: how many threads encode, each a frame of its own; a frame that is alone has all of them.  0: one for
             each core.
-        make_encoders: makes the encoders; None: such threads.
     """
 
     def __init__(
-        self,
-        catalogue: EncoderCatalogue,
-        limits: Limits,
-        queue_length: int,
-        threads: int,
-        metrics: Metrics,
-        make_encoders: MakeEncoders | None = None,
+        self, catalogue: EncoderCatalogue, limits: Limits, queue_length: int, threads: int, metrics: Metrics
     ) -> None:
         self._catalogue, self._metrics = catalogue, metrics
         self._room, self._bulk_room = SharedRoom(queue_length), SharedRoom(max(1, queue_length // 2))
         self._loaded: dict[str, Encoder] = {}
         share_cores(threads or cores())
-        self.encoders = EncoderThreads(limits) if make_encoders is None else make_encoders(limits, metrics)
+        self.encoders = EncoderThreads(limits)
         self._loader = ThreadPoolExecutor(1, "encoder-loader")
 
     def close(self) -> None:
@@ -200,14 +193,13 @@ class EncoderQueue:
         mask: Mask | None = None,
         after_encoding: AfterEncoding | None = None,
         keypoints: bool = False,
-        features: bool = False,
     ) -> Encoded:
         """Wait in the queue, then decode and encode one frame; call it within ``place``.
 
         Args:
             data: the bytes of a JPEG, PNG or WebP file.
             mask: the part of the frame that is ignored.
-            keypoints, features, after_encoding: see :class:`QueuedFrame`.
+            keypoints, after_encoding: see :class:`QueuedFrame`.
 
         Raises:
             DeadlineExceeded, ClientGone: the request ended before the encoding began; the frame was not encoded.
@@ -216,9 +208,7 @@ class EncoderQueue:
             EncoderNotInstalled, InvalidModel: see ``load``.
         """
         encoder = await self._load_in_time(identity, deadline)
-        frame = QueuedFrame(
-            encoder, data, mask, deadline.at, keypoints=keypoints, features=features, after_encoding=after_encoding
-        )
+        frame = QueuedFrame(encoder, data, mask, deadline.at, keypoints=keypoints, after_encoding=after_encoding)
         place = _place()
         place.frames = [frame]
         self.encoders.put([frame])
@@ -245,7 +235,7 @@ class EncoderQueue:
     ) -> AsyncGenerator[Outcomes]:
         """Encode the frames of a bulk request; call it within ``place``.
 
-        At most ``encoders.ahead`` of them wait at a time, and robots' frames go first.  When the generator is closed,
+        At most ``AHEAD`` of them wait at a time, and robots' frames go first.  When the generator is closed,
         waiting frames leave the queue.
 
         Args:
@@ -264,12 +254,12 @@ class EncoderQueue:
         encoder = await self._load_in_time(identity, deadline)
         hidden = [None] * len(frames) if masks is None else masks
         open_: dict[asyncio.Future[Encoded], tuple[int, QueuedFrame]] = {}
-        begun, bulk, ahead, place = 0, len(frames) > 1, self.encoders.ahead, _place()
+        begun, bulk, place = 0, len(frames) > 1, _place()
         gone = asyncio.ensure_future(deadline.hung_up())
         try:
             while begun < len(frames) or open_:
                 place.check()
-                following = range(begun, min(len(frames), begun + ahead - len(open_)))
+                following = range(begun, min(len(frames), begun + AHEAD - len(open_)))
                 queued = [QueuedFrame(encoder, frames[i], hidden[i], deadline.at, bulk, keypoints) for i in following]
                 self.encoders.put(queued)
                 open_ |= {

@@ -6,6 +6,7 @@ from core.disk.files import FolderLock, disk_errors, make_folder
 from core.disk.permissions import close_to_others
 from core.store import Directory, Store, open_cluster
 from service.access import key_file
+from service.open_files import most_open_maps
 from service.settings import Settings
 
 
@@ -21,17 +22,19 @@ class OpenStore:
 
     def __init__(self, settings: Settings) -> None:
         self.maps: Store
+        self.most_open: int
+        """The number of maps that may be open at the same time."""
         self._lock: FolderLock | None = None
         with disk_errors(f"open the data directory {settings.data_dir}"):
             make_folder(settings.data_dir)
             close_to_others(settings.data_dir, but=frozenset({key_file.FILE}))
-        if settings.engine == "files":
-            self.maps = Directory(settings.data_dir)
+        self.most_open = most_open_maps(settings)
+        if settings.database is None:
+            self.maps = Directory(settings.data_dir, self.most_open)
             return
         with disk_errors(f"open the data directory {settings.data_dir}"):
             self._lock = FolderLock(settings.data_dir / "LOCK")
         try:
-            assert settings.database is not None  # the settings were checked
             cluster = open_cluster(settings.database.get_secret_value(), settings.row_cache_bytes)
         except BaseException:
             self._lock.release()

@@ -76,12 +76,11 @@ class NotReady(Fault):
 
     Args:
         checks: the result of each check, "ok" or what is wrong.
-        public: as that of all errors; it stands for what is wrong, too.
     """
 
-    def __init__(self, detail: str, checks: dict[str, str], public: str | None = None) -> None:
+    def __init__(self, detail: str, checks: dict[str, str]) -> None:
         super().__init__(detail)
-        self.checks, self.public = checks, public
+        self.checks = checks
 
 
 class EncoderNotInstalled(Fault):

@@ -166,13 +166,11 @@ async def match(
     options = options.joined(fields)
     identity = await in_thread(engine.resolve, options.encoder)
     wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")
-    explained = options.explain or wanted == "png"
     with engine.queue.place():
-        a = await engine.queue.encode(identity, first, deadline, features=explained)
-        a = await in_thread(scaled_for_drawing, a)
-        b = await engine.queue.encode(identity, second, deadline, features=explained)
+        a = await in_thread(scaled_for_drawing, await engine.queue.encode(identity, first, deadline))
+        b = await engine.queue.encode(identity, second, deadline)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
-    explanation = await in_thread(explain_pair, a, b) if explained else None
+    explanation = await in_thread(explain_pair, a, b) if options.explain or wanted == "png" else None
     if explanation is not None and wanted == "png":
         drawn = await in_thread(draw_explanation, explanation, a.pixels, b.pixels)
         return Response(drawn, headers={"X-Encoder": identity, "X-Score": str(explanation.score)}, media_type=PNG)

@@ -12,7 +12,6 @@ import functools
 import logging
 import math
 import os
-import resource
 import signal
 import socket
 import time
@@ -28,9 +27,6 @@ from service.http.connections import Connections
 from service.http.http_connection import HttpConnection
 from service.http.websocket_connection import WebSocketConnection
 from service.settings import Settings
-
-SPARE_FILES = 1024
-"""Open files besides the connections, most of them files of maps."""
 
 LAST_WORD_SECONDS = 1.0
 """How long a request that is cancelled has for its answer, which says so."""
@@ -89,7 +85,6 @@ def serve_application(
         message = f"Cannot listen on port {settings.port} of {settings.host}. Is another service running there?"
         raise CannotListen(message) from error
     detect_dead_peers(listener, settings)
-    raise_file_limit(settings.max_connections)
 
     async def run() -> None:
         async with lifespan():
@@ -97,7 +92,7 @@ def serve_application(
             # these handlers the process would end there, before the application is closed.
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: None)
-            server = DrainingServer(config, settings.drain_seconds, on_signal, on_stop, keeps_handlers=settings.ray)
+            server = DrainingServer(config, settings.drain_seconds, on_signal, on_stop)
             await server.serve(sockets=[listener])
 
     with asyncio.Runner(loop_factory=config.get_loop_factory()) as runner, listener:
@@ -110,10 +105,6 @@ class DrainingServer(uvicorn.Server):
     At the first SIGTERM or SIGINT ``on_signal`` is called, and for ``drain_seconds`` every request is still answered.
     Then ``on_stop`` is called, nothing new is accepted, and the requests under way have the configured time to end.
     A second signal ends the waiting.
-
-    Args:
-        keeps_handlers: set the handlers of the signals again and again, since a library that is loaded meanwhile, as
-            Ray, sets others, which end the process at once.
     """
 
     def __init__(
@@ -122,10 +113,8 @@ class DrainingServer(uvicorn.Server):
         drain_seconds: float,
         on_signal: Callable[[], None],
         on_stop: Callable[[], None],
-        keeps_handlers: bool = False,
     ) -> None:
         super().__init__(config)
-        self._keeps_handlers = keeps_handlers
         self._drain_seconds, self._on_signal, self._on_stop = drain_seconds, on_signal, on_stop
         self._stop_at: float | None = None
 
@@ -141,9 +130,6 @@ class DrainingServer(uvicorn.Server):
 
     async def on_tick(self, counter: int) -> bool:
         """Whether to stop now; uvicorn calls it several times a second."""
-        if self._keeps_handlers:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, self.handle_exit)
         if self._stop_at is not None and time.monotonic() >= self._stop_at:
             self.should_exit = True
         return await super().on_tick(counter)
@@ -171,15 +157,3 @@ def detect_dead_peers(listener: socket.socket, settings: Settings) -> None:
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, max(1, seconds))
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, max(1, seconds // 3))
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-
-
-def raise_file_limit(connections: int) -> None:
-    """Request as many open files from the system as the connections and the maps may need; warn if it refuses."""
-    wanted = connections + SPARE_FILES
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
-    if soft != resource.RLIM_INFINITY and soft < most:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-        soft = most
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        log.warning("the system allows %d open files; %d connections and the maps want %d", soft, connections, wanted)

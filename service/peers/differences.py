@@ -25,8 +25,6 @@ from service.settings import Settings
 
 COMMON = (
     "encoder",
-    "engine",
-    "milvus_database",
     "rate_per_key",
     "rate_burst",
     "request_timeout",

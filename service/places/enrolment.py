@@ -13,6 +13,7 @@ from core.maps import Change, Enrolment, Reject, SameFrame, refuse_all
 from core.places import Place, PlaceFields, look_address
 from core.recognition.recognition import describe, frame_digest
 from core.store import Map
+from service.engine.encoder_threads import AHEAD
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
@@ -175,7 +176,7 @@ async def enrol(
                                 refuse(i, made)
                             else:
                                 enrolments[i], times[i] = made
-                        if batch_turn is not None and len(sent) - len(enrolments) <= engine.queue.encoders.ahead:
+                        if batch_turn is not None and len(sent) - len(enrolments) <= AHEAD:
                             batch_turn.report(Stage.ENCODED)
         if batch_turn is not None:
             batch_turn.report(Stage.ENCODED)

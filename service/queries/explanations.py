@@ -44,7 +44,7 @@ DRAWN = 60
 
 def scaled_for_drawing(encoded: Encoded) -> Encoded:
     """A copy whose pixels are scaled to the size of the drawing: a frame of 40 megapixels would fill the memory."""
-    return replace(encoded, source=scaled(encoded.pixels))
+    return replace(encoded, pixels=scaled(encoded.pixels))
 
 
 async def explain_match(
@@ -75,7 +75,7 @@ async def explain_match(
         with suppress(UnknownCamera):  # the camera was deleted after the place was enrolled
             mask = await camera_mask(map_, place.camera)
         with engine.queue.place():
-            encoded = await engine.queue.encode(map_.record.encoder, picture, deadline, mask, features=True)
+            encoded = await engine.queue.encode(map_.record.encoder, picture, deadline, mask)
     match = replace(stored, regions=None if encoded is None else encoded.encoding.regions)
     shown = Shown(query.encoding.descriptor, query.encoding.local, query.encoding.regions)
     explained = await in_thread(lambda: explanation_view(encoder, explain(encoder, shown, match), shown, match))

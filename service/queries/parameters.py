@@ -266,7 +266,7 @@ class QueryParameters(LocateParameters):
 
     def question(self) -> Question:
         """The question; see ``selection`` for errors."""
-        return Question(self.k, self.selection(), self.verify, self.camera, self.explain)
+        return Question(self.k, self.selection(), self.verify, self.camera)
 
 
 class SingleQueryParameters(QueryParameters):

@@ -6,18 +6,14 @@ import json
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import httpx
@@ -27,11 +23,9 @@ import pytest
 import yaml
 from compose_spec import PyCompose
 
-from core.errors import StorageFailure
 from service.settings import Settings
 from tests.project.test_container import seconds, service
 from tests.servers.postgres import Postgres
-from tests.servers.process import Server, fixed_ports
 from tests.service.balancer import balanced, nginx_with
 from tests.service.server import free_port
 
@@ -42,8 +36,6 @@ GUIDE = ROOT / "docs/how-to/run-a-cluster.md"
 MANIFESTS = sorted((DOCKER / "kubernetes").rglob("*.yaml"))
 VERSION = "1.31"
 """Of Kubernetes, the oldest that the manifests are meant for."""
-RAY_SECRET = ("ray", "token")
-"""Name and key of the secret of Kubernetes that no file has."""
 
 
 @cache
@@ -130,77 +122,10 @@ def test_no_password_stands_in_a_file() -> None:
         assert {value for value in found["stringData"].values() if "change-me" not in value} <= {""}, name
 
 
-def test_all_that_speak_ray_share_a_token_that_no_file_has() -> None:
-    speaking = {
-        name: found for name, found in compose()["services"].items() if found.get("image") == "placerec:cluster"
-    }
-    assert {"placerec-1", "placerec-2", "ray-head", "ray-worker"} <= set(speaking)
-    for name, found in speaking.items():
-        assert found["environment"]["RAY_AUTH_MODE"] == "token", name
-        required = re.fullmatch(r"\$\{RAY_TOKEN:\?(.*)\}", found["environment"]["RAY_AUTH_TOKEN"])
-        assert required and "openssl rand -hex 32" in required[1], name
-    for name in ("placerec", "ray-head", "ray-worker"):
-        given = {one["name"]: one for one in container_of("Deployment", name)["env"]}
-        assert given["RAY_AUTH_MODE"]["value"] == "token", name
-        reference = given["RAY_AUTH_TOKEN"]["valueFrom"]["secretKeyRef"]
-        assert reference == dict(zip(("name", "key"), RAY_SECRET, strict=True)), "it is missing, or may be missing"
-    assert RAY_SECRET[0] not in objects("Secret"), "a token in a file is known to everybody"
-    for line in ("export RAY_TOKEN=$(openssl rand -hex 32)", "--from-literal=token=$(openssl rand -hex 32)"):
-        assert line in GUIDE.read_text(), "the guide does not say how it is made"
-
-
-@pytest.fixture
-def ray_folder() -> Iterator[Path]:
-    """A folder with a short name: Ray's sockets are in it."""
-    with TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder:
-        yield Path(folder)
-
-
-@pytest.mark.cluster
-@pytest.mark.timeout(900)
-@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
-def test_head_and_worker_find_each_other_by_the_token_and_strangers_do_not(ray_folder: Path) -> None:
-    """By the commands and variables of their files, with another port, as processes of this machine."""
-    services = compose()["services"]
-    (port,) = fixed_ports(1)
-    address = f"{socket.gethostbyname(socket.gethostname())}:{port}"
-    token = {**services["ray-head"]["environment"], "RAY_AUTH_TOKEN": "5c" * 32}
-    check = [word.replace("6379", str(port)) for word in services["ray-head"]["healthcheck"]["test"][1:]]
-    check[0] = sys.executable
-
-    def node(name: str, *options: str) -> Server:
-        folder = ray_folder / name
-        folder.mkdir()
-        words = [*services[name]["entrypoint"], *services[name]["command"], *options]
-        words = [word.replace("ray-head:6379", address).replace("6379", str(port)) for word in words]
-        command: list[str | Path] = [Path(sys.executable).parent / words[0], *words[1:]]
-
-        def answers() -> None:
-            checked = subprocess.run(check, stderr=subprocess.DEVNULL)
-            if checked.returncode or "Ray runtime started" not in (folder / "output.log").read_text():
-                raise StorageFailure("not yet")
-
-        return Server(command, folder, answers, variables=token)
-
-    head, worker = node("ray-head", f"--temp-dir={ray_folder}/r"), node("ray-worker")
-    try:
-        head.start()
-        worker.start()  # it waits for the head to take it
-        command = [str(Path(sys.executable).parent / "ray"), "health-check", "--address", address]
-        stranger = {**os.environ, "RAY_AUTH_MODE": "disabled"}
-        refused = subprocess.run(command, env=stranger, capture_output=True, text=True)
-        assert refused.returncode != 0 and "InvalidAuthToken" in refused.stdout + refused.stderr
-    finally:
-        for server in (worker, head):
-            with suppress(AssertionError):  # it was not started
-                server.kill()
-
-
 def test_both_say_the_same_of_the_service_and_of_milvus() -> None:
     replica, told = compose()["services"]["placerec-1"], objects("ConfigMap")["placerec"]["data"]
     given = replica["environment"]
-    for name in ("PLACEREC_VECTORS", "PLACEREC_MILVUS", "PLACEREC_RAY", "PLACEREC_RAY_ADDRESS"):
-        assert given[name] == told[name]
+    assert given["PLACEREC_MILVUS"] == told["PLACEREC_MILVUS"]
     own = yaml.safe_load((DOCKER / "milvus.yaml").read_text())
     assert own == yaml.safe_load(objects("ConfigMap")["milvus"]["data"]["user.yaml"])
     assert compose()["services"]["milvus"]["image"] == container_of("StatefulSet", "milvus")["image"]
@@ -262,7 +187,7 @@ def test_what_names_a_deployment_finds_it() -> None:
         if (key := variable.get("valueFrom", {}).get("secretKeyRef"))
     }
     in_files = {(name, key) for name, found in objects("Secret").items() for key in found["stringData"]}
-    assert named == in_files | {RAY_SECRET}
+    assert named == in_files
 
 
 def test_what_is_not_allowed_in_the_network_is_refused() -> None:
@@ -271,10 +196,8 @@ def test_what_is_not_allowed_in_the_network_is_refused() -> None:
     assert everyone["podSelector"] == {} and set(everyone["policyTypes"]) == {"Ingress", "Egress"}
     assert "ingress" not in everyone and all(rule["to"] for rule in everyone["egress"])
     apps = {template["metadata"]["labels"]["app"] for template in pods().values()}
-    assert apps_of(policies["ray"]["podSelector"]) == {"placerec", "ray-head", "ray-worker"}
-    for name in ("ray", "stores"):
-        ((sender,),) = (rule["from"] for rule in policies[name]["ingress"])
-        assert apps_of(policies[name]["podSelector"]) | apps_of(sender["podSelector"]) <= apps
+    ((sender,),) = (rule["from"] for rule in policies["stores"]["ingress"])
+    assert apps_of(policies["stores"]["podSelector"]) | apps_of(sender["podSelector"]) <= apps
     assert apps_of(policies["stores"]["podSelector"]) == set(objects("StatefulSet"))
     (robots,) = policies["placerec"]["ingress"]
     assert [port["port"] for port in robots["ports"]] == ["http"] and "podSelector" not in robots["from"][0]
@@ -284,16 +207,6 @@ def apps_of(selector: dict[str, Any]) -> set[str]:
     (expression,) = selector["matchExpressions"]
     assert (expression["key"], expression["operator"]) == ("app", "In")
     return set(expression["values"])
-
-
-def test_ray_has_cheap_probes_and_time_to_stop() -> None:
-    for name, seconds_needed in (("ray-head", 33), ("ray-worker", 22)):
-        container = container_of("Deployment", name)
-        assert not [probe for probe in container if probe.endswith("Probe") and "exec" in container[probe]]
-        grace = pods()[name]["spec"]["terminationGracePeriodSeconds"]
-        assert grace >= 1.3 * seconds_needed and seconds(compose()["services"][name]["stop_grace_period"]) == grace
-    test = compose()["services"]["ray-head"]["healthcheck"]["test"]
-    assert test[:2] == ["CMD", "python"] and "import socket;" in test[-1]
 
 
 def test_alerts_count_by_series_of_the_service() -> None:
@@ -370,7 +283,7 @@ def test_limits_of_nginx_are_those_of_the_tls_proxy() -> None:
 def test_the_image_of_a_cluster_has_its_packages() -> None:
     arguments = compose()["services"]["placerec-1"]["build"]["args"]
     locked = (ROOT / f"requirements/{arguments['PROFILE']}.lock").read_text()
-    assert {"psycopg-binary", "pymilvus", "ray"} <= set(re.findall(r"^([\w-]+)==", locked, re.MULTILINE))
+    assert {"psycopg-binary", "pymilvus"} <= set(re.findall(r"^([\w-]+)==", locked, re.MULTILINE))
     assert set(service()["build"]["args"]) < set(arguments)
 
 

@@ -64,7 +64,6 @@ def test_image_runs_as_a_user_of_its_own() -> None:
 
 
 def test_what_would_report_is_switched_off() -> None:
-    """Also where ``ray start`` runs in the image, which imports nothing of the project."""
     assert environment().items() >= SWITCHES.items()
 
 

@@ -53,15 +53,14 @@ OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py", ROOT / "examples/simulator"
 EXTRAS = {
     "core/ledger/postgres": {"cluster"},
     "core/maps/formats/mcap": {"bags"},
-    "core/milvus": {"milvus"},
-    "core/postgres": {"cluster"},
+    "core/index/milvus": {"milvus"},
+    "core/store/cluster": {"cluster"},
     "core/recordings": {"bags"},
     "examples": {"bags"},
     "lab": {"lab"},
     "scripts/manifests": {"dev"},
     "service/peers/differences": {"cluster"},
     "service/peers/replica": {"cluster"},
-    "service/ray_serve": {"ray"},
     "service/shared": {"cluster"},
 }
 """Folders and modules that may import what an extra brings; tests and benchmarks may import all."""

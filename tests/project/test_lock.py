@@ -59,8 +59,8 @@ def test_the_packages_of_ros_are_locked_within_their_ranges() -> None:
     [
         ("service", []),
         ("lab", ["lab"]),
-        ("replica", ["milvus", "ray"]),
-        ("development", ["dev", "lab", "milvus", "ray"]),
+        ("replica", ["milvus"]),
+        ("development", ["dev", "lab", "milvus"]),
     ],
 )
 def test_every_dependency_is_locked_within_its_range(name: str, extras: list[str]) -> None:

@@ -21,10 +21,9 @@ from scripts.manifests import CHART, rendered  # noqa: E402
 NO = {"enabled": False}
 VARIANTS: dict[str, dict[str, Any]] = {
     "defaults": {},
-    "without Ray": {"ray": NO},
     "without Milvus": {"milvus": NO},
     "stores elsewhere": {"stores": NO, "network": {"to": [{"cidr": "192.0.2.7/32", "port": 5432}]}},
-    "PostgreSQL alone": {"ray": NO, "milvus": NO},
+    "PostgreSQL alone": {"milvus": NO},
     "no ingress, rules or backup": {"ingress": NO, "network": NO, "backup": NO},
     "all given": {
         "image": "registry.example.org/placerec:1",
@@ -105,8 +104,6 @@ def test_the_notes_make_the_secrets_that_pods_wait_for(variant: str) -> None:
 @pytest.mark.parametrize(
     ("variant", "word"),
     [
-        ("without Ray", "ray-head"),
-        ("without Ray", "RAY_AUTH"),
         ("without Milvus", "etcd:2379"),
         ("without Milvus", "PLACEREC_MILVUS"),
         ("PostgreSQL alone", "serviceName: etcd"),
@@ -122,11 +119,6 @@ def test_what_is_left_out_is_nowhere(variant: str, word: str) -> None:
         return " ".join(" ".join(texts).split()) + " "
 
     assert word in words("defaults") and word not in words(variant)
-
-
-def test_without_ray_the_service_is_the_image_s_own_program() -> None:
-    (service,) = (one for one in containers_of(objects_of("without Ray")) if one["name"] == "placerec")
-    assert "command" not in service and "args" not in service
 
 
 def test_values_reach_what_they_name() -> None:
@@ -154,7 +146,7 @@ def test_values_reach_what_they_name() -> None:
         {"replicas": 3},
         {"service": {"replicas": "three"}},
         {"settings": {"LOG_LEVEL": "debug"}},
-        {"settings": {"PLACEREC_RAY": "false"}},  # it has a value of its own
+        {"settings": {"PLACEREC_MILVUS": "http://other"}},  # it has a value of its own
         {"stores": {"postgres": {"storage": "much"}}},
     ],
 )

@@ -40,7 +40,15 @@ from tests.release.surface import broken, interface, missing
 from tests.service.server import ROOT, Server
 
 GONE = [
-    *(f"settings: objects{part}" for part in ("", "_access_key", "_certificate", "_endpoint", "_region", "_secret_key")),
+    *(
+        f"settings: objects{part}"
+        for part in ("", "_access_key", "_certificate", "_endpoint", "_region", "_secret_key")
+    ),
+    *(f"settings: ray{part}" for part in ("", "_address", "_batch", "_max_replicas", "_replica_cpus", "_replica_gpus")),
+    *(f"settings: ray{part}" for part in ("_replicas", "_scale_seconds")),
+    *(f"commands: placerec ray {words}" for words in ("deploy", "deploy --address", "deploy --timeout", "start")),
+    *(f"commands: placerec ray {words}" for words in ("status", "status --address")),
+    "commands: placerec serve --ray",
     "metrics: placerec_indexes_building",
 ]
 """The names of 1.0 that 2.0 does not have."""

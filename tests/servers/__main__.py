@@ -13,38 +13,31 @@ import shlex
 import signal
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 
 from tests.servers.postgres import running_postgres
 from tests.servers.process import Missing
 
 
 @contextmanager
-def _postgres() -> Iterator[Mapping[str, str]]:
-    with running_postgres() as postgres:
-        yield {"DATABASE": postgres.address}
+def _servers(with_milvus: bool) -> Iterator[Mapping[str, str]]:
+    with ExitStack() as stack:
+        settings = {"DATABASE": stack.enter_context(running_postgres()).address}
+        if with_milvus:
+            from tests.servers.milvus import running_milvus  # needs Milvus's client
 
-
-@contextmanager
-def _all_servers() -> Iterator[Mapping[str, str]]:
-    from tests.servers.milvus import running_servers  # needs Milvus's client
-
-    with running_servers() as servers:
-        yield {
-            "DATABASE": servers.postgres_address,
-            "VECTORS": "milvus",
-            "MILVUS": servers.milvus_address,
-        }
+            settings["MILVUS"] = stack.enter_context(running_milvus()).address
+        yield settings
 
 
 def main() -> int:
     """Run the servers until Ctrl+C; the exit status is 1 if one is missing or does not start."""
     parser = argparse.ArgumentParser(prog="scripts/cluster", description="Start a PostgreSQL for trials.")
     parser.add_argument("--milvus", action="store_true", help="start a Milvus as well")
-    started = _all_servers if parser.parse_args().milvus else _postgres
+    with_milvus = parser.parse_args().milvus
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl+C does, with the servers
     try:
-        with started() as settings:
+        with _servers(with_milvus) as settings:
             print("Paste these lines where a service starts; Ctrl+C here ends the servers.", file=sys.stderr)
             for name, value in settings.items():
                 print(f"export PLACEREC_{name}={shlex.quote(value)}", flush=True)

@@ -1,23 +1,15 @@
-"""A real PostgreSQL and Milvus on this machine, in folders of their own.
-
-Milvus is the server of the package ``milvus`` in .venv-cluster, an old release.
-"""
+"""A real Milvus on this machine: the server of the package ``milvus`` in .venv-cluster, an old release."""
 
 from __future__ import annotations
 
 import shutil
-import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
-import psycopg
-
-from core.milvus.collection import MilvusConnection
-from tests.servers.postgres import postgres_server
+from core.index.milvus import Milvus
 from tests.servers.process import Missing, Server, fixed_ports
 
 ROOT = Path(__file__).parents[2]
@@ -60,34 +52,32 @@ initial-cluster: default=http://127.0.0.1:{peer}
 """Without it, two Milvus on one machine would want the same port."""
 
 
-class Servers:
-    """The servers, and their addresses."""
+class MilvusServer:
+    """A Milvus in a folder of its own.
 
-    def __init__(self, folder: Path, milvus_settings: Mapping[str, str] = MILVUS_SETTINGS) -> None:
+    address, process: its own.
+    token, certificate: by which its administrator comes in.
+    """
+
+    certificate: str | None
+
+    def __init__(self, folder: Path, settings: Mapping[str, str] = MILVUS_SETTINGS) -> None:
         if not MILVUS_PYTHON.exists():
             raise Missing("Milvus is not installed in .venv-cluster: scripts/test --cluster does it.")
-        ports = fixed_ports(2)
-        self.postgres_address = f"postgresql://placerec@127.0.0.1:{ports[0]}/postgres"
-        self.milvus_address = f"http://127.0.0.1:{ports[1]}"
-        data = [folder / "postgres", folder / "milvus"]
-        for path in data:
-            path.mkdir(parents=True)
-        folder.chmod(0o755)
-        self.postgres = postgres_server(data[0], ports[0], self._ask_postgres)
-        self.milvus = _milvus(data[1], ports[1], milvus_settings, self._ask_milvus)
+        (port,) = fixed_ports(1)
+        self.address, self.token, self.certificate = f"http://127.0.0.1:{port}", "", None
+        self.process = _server(folder, port, settings, self.ask)
 
-    def _ask_postgres(self) -> None:
-        psycopg.connect(self.postgres_address, connect_timeout=5).close()
-
-    def _ask_milvus(self) -> None:
-        connection = MilvusConnection(self.milvus_address, "", "", None)
+    def ask(self) -> None:
+        """Raise unless it answers."""
+        asking = Milvus(self.address, self.token, certificate=self.certificate)
         try:
-            connection.check()
+            asking.check()
         finally:
-            connection.close()
+            asking.close()
 
 
-def _milvus(folder: Path, port: int, settings: Mapping[str, str], answers: Callable[[], None]) -> Server:
+def _server(folder: Path, port: int, settings: Mapping[str, str], answers: Callable[[], None]) -> Server:
     """A Milvus that keeps its data and its ports when it is started again."""
     others = fixed_ports(20)
     ports = ",".join(str(other) for other in (*others[3:], port))
@@ -106,22 +96,20 @@ def _milvus(folder: Path, port: int, settings: Mapping[str, str], answers: Calla
 
 
 @contextmanager
-def running_servers() -> Iterator[Servers]:
-    """The servers, as long as the block runs.
+def running_milvus() -> Iterator[MilvusServer]:
+    """A Milvus, as long as the block runs.
 
     Raises:
-        Missing: one is not installed.
-        TimeoutError: one does not answer.
+        Missing: it is not installed.
+        TimeoutError: it does not answer.
     """
-    folder = Path(tempfile.mkdtemp(prefix="placerec-cluster-"))
-    servers = None
+    folder = Path(tempfile.mkdtemp(prefix="placerec-milvus-"))
+    server = None
     try:
-        servers = Servers(folder)
-        with ThreadPoolExecutor() as starting:
-            list(starting.map(Server.start, (servers.postgres, servers.milvus)))
-        yield servers
+        server = MilvusServer(folder)
+        server.process.start()
+        yield server
     finally:
-        if servers is not None:
-            servers.milvus.end()
-            servers.postgres.end(signal.SIGINT)
+        if server is not None:
+            server.process.end()
         shutil.rmtree(folder, ignore_errors=True)

@@ -57,9 +57,9 @@ STRICT: dict[str, object] = {
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--store",
-        choices=("files", "postgres", "milvus"),
+        choices=("files", "postgres"),
         default="files",
-        help="what keeps the vectors of the server of most tests; postgres and milvus start what they need",
+        help="where the maps of the server of most tests are; postgres starts one",
     )
 
 
@@ -69,14 +69,8 @@ def store_settings(kind: str) -> Iterator[dict[str, object]]:
     if kind == "files":
         yield {}
         return
-    if kind == "postgres":
-        with running_postgres() as postgres:
-            yield {"database": postgres.address}
-        return
-    from tests.servers.milvus import running_servers  # needs what speaks to them
-
-    with running_servers() as servers:
-        yield {"vectors": kind, "milvus": servers.milvus_address, "database": servers.postgres_address}
+    with running_postgres() as postgres:
+        yield {"database": postgres.address}
 
 
 @pytest.fixture(scope="session")

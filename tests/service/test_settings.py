@@ -102,7 +102,8 @@ def test_addresses_of_no_database(monkeypatch: pytest.MonkeyPatch, address: str)
 @pytest.mark.parametrize("address", ["postgresql://placerec:word@db/placerec", "host=db dbname=placerec"])
 def test_addresses_of_a_database(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
     monkeypatch.setenv("PLACEREC_DATABASE", address)
-    assert read_settings().engine == "postgres"
+    found = read_settings().database
+    assert found is not None and found.get_secret_value() == address
 
 
 def test_a_file_is_no_folder_for_backups(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -6,11 +6,9 @@ way; what it says to others and where it writes is seen by :mod:`tests.watch`.
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -43,7 +41,7 @@ def wrapped(watch: Watch, folder: Path) -> list[str]:
     places = {"HOME": folder / "home", "XDG_CACHE_HOME": folder / "home" / "cache", "TMPDIR": folder / "temporary"}
     for place in places.values():
         place.mkdir(parents=True, exist_ok=True)
-    wrong = dict.fromkeys(SWITCHES, "0") | {"RAY_USAGE_STATS_ENABLED": "1", "FASTAPI_OTEL_AUTO_CONFIGURE": "true"}
+    wrong = dict.fromkeys(SWITCHES, "0") | {"FASTAPI_OTEL_AUTO_CONFIGURE": "true"}
     unset = [word for name in (*MACHINES_THAT_BUILD, *CACHES, *PROXIES) for word in ("-u", name)]
     return ["/usr/bin/env", *unset, *(f"{name}={value}" for name, value in (places | wrong).items()), *watch.wrapper]
 
@@ -124,21 +122,3 @@ def run(watch: Watch, folder: Path, *words: object) -> None:
         command = [*wrapped(watch, folder), sys.executable, "-m", "service.commands", *map(str, words)]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.cluster
-@pytest.mark.timeout(600)
-def test_a_ray_of_its_own(watch: Watch) -> None:
-    """Its nodes and the processes that encode keep to this machine, and ask nobody which cloud this is."""
-    with TemporaryDirectory() as name, watch:  # a test's own folder has a name too long for Ray's sockets
-        folder = Path(name)
-        server = Server(folder / "server", {"ray": True, "threads": 1}, wrapper=wrapped(watch, folder))
-        try:
-            use(server.wait(seconds=400))  # a busy machine may need several attempts to start Ray
-        finally:
-            status = server.stop()
-    assert status == 0
-    here = re.compile(r"(127\.0\.0\.1|\[::ffff:127\.0\.0\.1\]|\[::1\]):(?!53$)\d+")
-    assert {told for told in watch.told() if not here.fullmatch(told)} == set()
-    own = [server.data_dir, folder / "temporary", folder / "home" / ".ray"]
-    assert {path for path in watch.written(own) if "/__pycache__" not in path} == set()

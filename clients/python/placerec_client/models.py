@@ -1531,6 +1531,15 @@ class MemoryState(Model):
     upload_limit: int
 
 
+class OpenState(Model):
+    """What is open, and how much may be."""
+
+    maps: int
+    most_maps: int
+    files: int | None = None
+    most_files: int
+
+
 class OperationState(Model):
     """The requests of one operation in the last minutes; durations in milliseconds."""
 
@@ -1655,6 +1664,7 @@ class Readiness(Model):
     checks: dict[str, str]
     encoder: str
     quarantined: list[QuarantinedMap]
+    open: OpenState
 
 
 class RecentAnswerView(Model):

@@ -186,7 +186,7 @@ class Review:
             return len(going)
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
-        """The latest frames, newest first, and how many are stored in all, as of one moment.
+        """The latest frames, newest first, and how many are stored in all, as of one moment; without damaged ones.
 
         Args:
             before: only frames with a smaller number; None: all.
@@ -194,18 +194,19 @@ class Review:
         """
         with self._reading() as connection:
             found = connection.execute(_PAGES[labelled], before=2**62 if before is None else before, most=limit)
-            return StoredReviews([_frame(values) for values in found], *_size(connection))
+            return StoredReviews(_frames(found), *_size(connection))
 
     def labelled(self) -> list[ReviewFrame]:
-        """All frames with a label, oldest first."""
+        """All frames with a label, oldest first; without damaged ones."""
         with self._reading() as connection:
-            return [_frame(values) for values in connection.execute(_LABELLED)]
+            return _frames(connection.execute(_LABELLED))
 
     def find(self, number: int) -> ReviewFrame:
         """One frame.
 
         Raises:
             UnknownFrame: it is not stored.
+            StorageFailure: it is damaged.
         """
         with self._reading() as connection:
             return _frame(_expect(connection, number))
@@ -261,7 +262,8 @@ class Review:
             UnknownFrame: it is not stored.
         """
         with self._writing() as connection:
-            _expect(connection, number)
+            if connection.one(_FIND, number=number) is None:
+                raise _unknown(number)
             drop(connection, [number])
 
 
@@ -281,10 +283,9 @@ def stored_frames(
     before: int | None = None
     while True:
         look()
-        page = review.page(before, PAGE, labelled).frames
-        yield from page
-        if len(page) < PAGE:
+        if not (page := review.page(before, PAGE, labelled).frames):
             return
+        yield from page
         before = page[-1].number
 
 
@@ -301,8 +302,7 @@ def _labelled(
 
 def _renewed(connection: MapConnection, known: tuple[Any, ...], answer: Mapping[str, Any]) -> bool:
     """Give a stored frame another answer, unless it has a label; whether it got it."""
-    *columns, _ = known
-    before = dict(zip(_COLUMNS, columns, strict=True))
+    before = dict(zip(_COLUMNS, _checked(known)[:-1], strict=True))
     changed = sealed(_COLUMNS, {**before, "answer": json.dumps(answer)})
     values = {"which": before["number"], "new_answer": changed["answer"], "new_seal": changed["seal"]}
     return before["label"] is None and bool(connection.change(_RENEW, **values))
@@ -335,7 +335,18 @@ def _expect(connection: MapConnection, number: int) -> tuple[Any, ...]:
     values = connection.one(_FIND, number=number)
     if values is None:
         raise _unknown(number)
+    return _checked(values)
+
+
+def _checked(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    *columns, seal = values
+    if not is_sound(columns, seal):
+        raise StorageFailure(f"The frame {columns[0]} is damaged; discard the frame.")
     return values
+
+
+def _frames(found: list[tuple[Any, ...]]) -> list[ReviewFrame]:
+    return [_frame(values) for values in found if is_sound(values[:-1], values[-1])]
 
 
 def _unknown(number: int) -> UnknownFrame:

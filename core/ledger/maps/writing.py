@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -481,9 +481,25 @@ class Write:
             descriptors, local = ({row: both[at] for row, both in self._new.items()} for at in (0, 1))
             rows.put(self._connection, "descriptors", descriptors)
             rows.put(self._connection, "locals", local)
-            if self.state.searched >= COMPACT_FROM or self.record.index == "compact":
-                codes = Coder.of(self._form.dimension).encode(self._form.descriptors(list(descriptors.values())))
-                rows.put(self._connection, "codes", dict(zip(self._new, map(bytes, codes), strict=True)))
+            if _has_codes(self.state):
+                self._put_codes(descriptors)
+        if _has_codes(self.state) and not _has_codes(self._before):
+            uncoded = rows.uncoded(self._connection)
+            for start in range(0, len(uncoded), _CODED_AT_ONCE):
+                some = uncoded[start : start + _CODED_AT_ONCE]
+                self._put_codes(rows.at(self._connection, "descriptors", some))
         if self.state != self._before:
             record.put_counters(self._connection, self.state)
             rows.note_revision(self._connection, self.state.revision, self.state.stamp)
+
+    def _put_codes(self, stored: Mapping[int, bytes]) -> None:
+        codes = Coder.of(self._form.dimension).encode(self._form.descriptors(list(stored.values())))
+        rows.put(self._connection, "codes", dict(zip(stored, map(bytes, codes), strict=True)))
+
+
+_CODED_AT_ONCE = 256
+
+
+def _has_codes(state: MapState) -> bool:
+    """Whether the rows of a map have codes; those of a map that is compared whole need none."""
+    return state.searched >= COMPACT_FROM or state.record.index == "compact"

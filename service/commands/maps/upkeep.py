@@ -98,9 +98,7 @@ def reencode(
 
 def rebuild(
     map_id: Annotated[str | None, typer.Argument(metavar="[MAP]", help="The map's id.", show_default=False)] = None,
-    all_: Annotated[
-        bool, typer.Option("--all", help="Instead: the indexes of all maps, one after another, as for a lost Milvus.")
-    ] = False,
+    all_: Annotated[bool, typer.Option("--all", help="Instead: the indexes of all maps, one after another.")] = False,
     wait: Wait = True,
     url: Url = None,
     data_dir: DataDir = None,

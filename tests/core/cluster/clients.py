@@ -1,6 +1,6 @@
 """Clients of a store that do what a load asks: in this process, and in one of their own that may be killed.
 
-python -m tests.core.cluster.clients ADDRESSES   # a line of JSON for each request, and one for each answer
+python -m tests.core.cluster.clients ADDRESS   # a line of JSON for each request, and one for each answer
 """
 
 from __future__ import annotations
@@ -11,55 +11,27 @@ import subprocess
 import sys
 import threading
 import traceback
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from core.errors import StorageFailure, UnknownPlace
-from core.milvus import open_store
-from core.postgres import open_database
-from core.postgres.map import PostgresMap
-from core.postgres.store import PostgresStore
+from core.store import Map, Store, open_cluster
 from tests.core.store.frames import descriptor_of, frame
 
 ROOT = Path(__file__).parents[3]
 
 
-@dataclass(frozen=True)
-class Addresses:
-    """Where a cluster's servers are; without a Milvus its maps are in PostgreSQL alone."""
-
-    postgres: str
-    milvus: str | None = None
-
-    def open(self) -> PostgresStore[Any]:
-        """The store of all its maps."""
-        if self.milvus is None:
-            return open_database(self.postgres)
-        return open_store(self.milvus, self.postgres)
-
-    def written(self) -> str:
-        """As one word of a command line."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def read(cls, written: str) -> Addresses:
-        """The addresses that were written as one word."""
-        return cls(**json.loads(written))
-
-
 class StoreClient:
     """Writes to and asks the map ``lab``."""
 
-    def __init__(self, store: PostgresStore[Any]) -> None:
+    def __init__(self, store: Store) -> None:
         self._store = store
 
     @property
-    def _lab(self) -> PostgresMap:
-        lab: PostgresMap = self._store.get("lab")
-        return lab
+    def _lab(self) -> Map:
+        return self._store.get("lab")
 
     def enrol(self, names: list[str], picture: str) -> None:
         """Places of these names, all with one picture, in one batch."""
@@ -87,8 +59,8 @@ class StoreClient:
 class ProcessClient:
     """The same in a process of its own, which is started when it is asked and not there.  One call at a time."""
 
-    def __init__(self, addresses: Addresses) -> None:
-        program = ["-m", "tests.core.cluster.clients", addresses.written()]
+    def __init__(self, address: str) -> None:
+        program = ["-m", "tests.core.cluster.clients", address]
         self._command = [sys.executable, "-W", "ignore", *program]
         self._process: subprocess.Popen[str] | None = None
         self._starting = threading.Lock()
@@ -152,14 +124,14 @@ class ProcessClient:
         return answer
 
 
-def main(addresses: str) -> None:
+def main(address: str) -> None:
     """Serve until there are no more requests."""
     logging.disable(logging.CRITICAL)  # that parts are away is no news here
     client: StoreClient | None = None
     for line in sys.stdin:
         method, *arguments = json.loads(line)
         try:
-            client = client or StoreClient(Addresses.read(addresses).open())
+            client = client or StoreClient(open_cluster(address))
             answer = ["done", getattr(client, method)(*arguments)]
         except UnknownPlace as error:
             answer = ["unknown", str(error)]

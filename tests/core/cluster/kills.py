@@ -1,6 +1,6 @@
 """Kills of the parts of a cluster under a load: nothing is lost, nothing half-written, no answer is wrong.
 
-    scripts/soak cluster --kills 100 --seed 7 [--vectors milvus] [--minutes 15]
+    scripts/soak cluster --kills 100 --seed 7 [--minutes 15]
 
 Two clients, one of them in a process of its own, write pairs of places in one batch each, forget places, and query; a
 model in plain values knows what each place may show.  What is killed, or stands still for a while, and when, is drawn
@@ -10,7 +10,6 @@ knows it and as one reads it that has just come.
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import random
@@ -22,14 +21,15 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from typing import Any, Generic
 
 from core.errors import StorageFailure, UnknownMap
+from core.store import open_cluster
 from tests.campaigns import read_arguments
 from tests.core.cluster.clients import ProcessClient, StoreClient
 from tests.core.cluster.load import May, PlaceLoad, check, running
-from tests.core.cluster.parts import POSTGRES, ClusterPart, KillableCluster, ServersT
+from tests.core.cluster.parts import PARTS, ClusterPart
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE
+from tests.servers.postgres import Postgres, running_postgres
 
 MOST_SECONDS = 60.0
 """From the start of a server, or the end of its silence, until both clients are served again."""
@@ -83,19 +83,19 @@ def _middle(seconds: Sequence[float]) -> str:
     return f"{statistics.median(seconds):.1f} s (at most {max(seconds):.1f})"
 
 
-class ClusterKills(Generic[ServersT]):
+class ClusterKills:
     """A map ``lab`` in a cluster, its model, and two clients."""
 
-    def __init__(self, cluster: KillableCluster[ServersT], servers: ServersT, seed: str) -> None:
-        self._seed, self._addresses = seed, cluster.addresses(servers)
-        self._store = self._addresses.open()
+    def __init__(self, postgres: Postgres, seed: str) -> None:
+        self._seed, self._address = seed, postgres.address
+        self._store = open_cluster(self._address)
         with suppress(UnknownMap):
             self._store.delete("lab")
         self._lab = self._store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
-        self._client = ProcessClient(self._addresses)
+        self._client = ProcessClient(self._address)
         self._may: list[May] = [{f"{letter}{number}": {None} for number in range(IDS)} for letter in "pq"]
-        self.parts = {name: made(servers, self._client) for name, made in cluster.parts.items()}
-        self.tally, self._kills, self._served = Tally(), Counter[str](), dict[str, float]()
+        self.parts = {name: made(postgres, self._client) for name, made in PARTS.items()}
+        self.tally, self._kills = Tally(), Counter[str]()
 
     def kill(self, part: str) -> Recovery:
         """Kill a part under the load, start it again, wait until both are served, and compare."""
@@ -103,7 +103,7 @@ class ClusterKills(Generic[ServersT]):
         self._kills[part] += 1
         seed = f"{self._seed}/{number}"
         draw = random.Random(seed)
-        self._lab.edit({"index": draw.choice(("exact", "compact"))})  # Milvus searches all maps alike
+        self._lab.edit({"index": draw.choice(("exact", "compact"))})
         clients: tuple[StoreClient | ProcessClient, ...] = StoreClient(self._store), self._client
         loads = [
             PlaceLoad(client, f"{seed}/{n}", may)
@@ -112,7 +112,6 @@ class ClusterKills(Generic[ServersT]):
         with running(loads):
             time.sleep(draw.uniform(0.2, 2.0))
             killed = self.parts[part]
-            time.sleep(max(0.0, self._served.get(part, 0.0) + killed.lives - time.monotonic()))
             self._store.sweep()  # must not take anything that counts
             killed.kill(draw)
             began = time.monotonic()
@@ -123,7 +122,6 @@ class ClusterKills(Generic[ServersT]):
             asking = threading.Thread(target=lambda: worked.append(_works_at(killed) - began))
             asking.start()
             first, served = (_served_at(loads, before, times, began + GIVEN_UP, part) - began for times in (1, SERVED))
-            self._served[part] = time.monotonic()
             asking.join()
             recovery = Recovery(answered, min(worked[0], first), first, served, os.getloadavg()[0])
             self.tally.recoveries.setdefault(part, []).append(recovery)
@@ -134,7 +132,7 @@ class ClusterKills(Generic[ServersT]):
             self.tally.refused += load.refused
         whole = self._may[0] | self._may[1]
         check(self._lab, whole)
-        with closing(self._addresses.open()) as fresh:
+        with closing(open_cluster(self._address)) as fresh:
             check(fresh.get("lab"), whole)
             report = fresh.verify("lab")
             assert report.ok, report.problems
@@ -173,26 +171,13 @@ def _works_at(part: ClusterPart) -> float:
     return time.monotonic()
 
 
-def cluster_of(vectors: str) -> KillableCluster[Any]:
-    """The kind of cluster whose vectors are searched by one engine."""
-    if vectors == "postgres":
-        return POSTGRES
-    from tests.core.milvus.parts import MILVUS  # needs Milvus's client
-
-    return MILVUS
-
-
 def main(arguments: Sequence[str]) -> int:
     """Kill until there were enough kills, or the time is over."""
-    engine = argparse.ArgumentParser(prog="scripts/soak cluster", add_help=False)
-    told = "what searches the maps (default: %(default)s)"
-    engine.add_argument("--vectors", choices=("postgres", "milvus"), default="postgres", help=told)
-    cluster = cluster_of(engine.parse_known_args(arguments)[0].vectors)
-    chosen = read_arguments(arguments, "cluster", __doc__, cluster.parts, kills=100, others=engine)
+    chosen = read_arguments(arguments, "cluster", __doc__, PARTS, kills=100)
     seed = chosen.seed
     logging.disable(logging.CRITICAL)  # that parts are away is no news here
     draw, began = random.Random(seed), time.monotonic()
-    with cluster.running() as servers, closing(ClusterKills(cluster, servers, seed)) as campaign:
+    with running_postgres() as postgres, closing(ClusterKills(postgres, seed)) as campaign:
         for number in range(1, chosen.kills + 1):
             part = draw.choice(chosen.parts)
             print(number, part, campaign.kill(part), flush=True)

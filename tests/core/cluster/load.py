@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from core.errors import StorageFailure, UnknownPlace
-from core.postgres.map import PostgresMap
+from core.store import Map
 from tests.core.cluster.clients import ProcessClient, StoreClient
 from tests.core.store.frames import descriptor_of, digest_of
 
@@ -129,7 +129,7 @@ def running(loads: Sequence[PlaceLoad]) -> Iterator[None]:
             load.stop()
 
 
-def check(lab: PostgresMap, may: May) -> None:
+def check(lab: Map, may: May) -> None:
     """Every place shows what it may show, is stored whole and is found."""
     outline, snapshot = lab.transfer.outline(), lab.snapshot()
     found = {place.id: place for place in outline}

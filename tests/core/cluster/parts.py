@@ -1,16 +1,14 @@
-"""The parts of a cluster that a campaign kills.  Another part is a class here and a line in ``POSTGRES``."""
+"""The parts of a cluster that a campaign kills.  Another part is a class here and a line in ``PARTS``."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from random import Random
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
-from tests.core.cluster.clients import Addresses, ProcessClient
-from tests.servers.postgres import running_postgres
+from tests.core.cluster.clients import ProcessClient
+from tests.servers.postgres import Postgres
 from tests.servers.process import Server
 
 AWAY_SECONDS = 1.0
@@ -19,18 +17,12 @@ AWAY_SECONDS = 1.0
 SILENT_SECONDS = 5.0, 25.0
 """The shortest and the longest silence: within it, readers (10 s) and writers (20 s) give up, or do not."""
 
-ServersT = TypeVar("ServersT")
-"""The servers of a cluster."""
-
 
 class ClusterPart(Protocol):
     """One thing that is killed, or falls silent, and comes back."""
 
     is_server: bool
     """Whether the bar on recovery is about it."""
-
-    lives: float
-    """Seconds for which it serves before it is killed again."""
 
     def kill(self, draw: Random) -> None:
         """End it by SIGKILL, or let it stand still for a time that is drawn."""
@@ -49,7 +41,7 @@ class ClusterPart(Protocol):
 class KilledServer:
     """A server all of whose processes are killed."""
 
-    is_server, lives = True, 0.0
+    is_server = True
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -73,7 +65,7 @@ class KilledPostgres(KilledServer):
 class SilentPostgres:
     """PostgreSQL all of whose processes stand still for a while, as on a machine that is paused."""
 
-    is_server, lives = True, 0.0
+    is_server = True
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -91,7 +83,7 @@ class SilentPostgres:
 class KilledClient:
     """A client in a process of its own; it takes as long as Python does to start."""
 
-    is_server, lives = False, 0.0
+    is_server = False
 
     def __init__(self, client: ProcessClient) -> None:
         self._client = client
@@ -106,26 +98,9 @@ class KilledClient:
         """Its answers are what is waited for anyway."""
 
 
-@dataclass(frozen=True)
-class KillableCluster(Generic[ServersT]):
-    """A kind of cluster: its servers, and its parts by name.
-
-    running: starts the servers, which run as long as the block does.
-    addresses: of them.
-    parts: each is made of the servers and the client that may be killed.
-    """
-
-    running: Callable[[], AbstractContextManager[ServersT]]
-    addresses: Callable[[ServersT], Addresses]
-    parts: Mapping[str, Callable[[ServersT, ProcessClient], ClusterPart]]
-
-
-POSTGRES = KillableCluster(
-    running_postgres,
-    lambda postgres: Addresses(postgres.address),
-    {
-        "postgres": lambda postgres, _: KilledPostgres(postgres.server),
-        "silence": lambda postgres, _: SilentPostgres(postgres.server),
-        "client": lambda _, client: KilledClient(client),
-    },
-)
+PARTS: Mapping[str, Callable[[Postgres, ProcessClient], ClusterPart]] = {
+    "postgres": lambda postgres, _: KilledPostgres(postgres.server),
+    "silence": lambda postgres, _: SilentPostgres(postgres.server),
+    "client": lambda _, client: KilledClient(client),
+}
+"""By name; each is made of the server and the client that may be killed."""

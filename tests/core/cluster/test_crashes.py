@@ -1,4 +1,4 @@
-"""Parts of a cluster without Milvus that are killed, or stand still, under a load: nothing acknowledged is lost."""
+"""Parts of a cluster that are killed, or stand still, under a load: nothing acknowledged is lost."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from contextlib import closing
 import pytest
 
 from tests.core.cluster.kills import ClusterKills
-from tests.core.cluster.parts import POSTGRES
 from tests.servers.postgres import Postgres
 
 pytestmark = [pytest.mark.postgres, pytest.mark.thorough, pytest.mark.timeout(600)]
@@ -15,6 +14,6 @@ pytestmark = [pytest.mark.postgres, pytest.mark.thorough, pytest.mark.timeout(60
 
 @pytest.mark.parametrize(("part", "times"), [("postgres", 3), ("silence", 1), ("client", 3)])
 def test_kills(postgres: Postgres, part: str, times: int) -> None:
-    with closing(ClusterKills(POSTGRES, postgres, part)) as campaign:
+    with closing(ClusterKills(postgres, part)) as campaign:
         for _ in range(times):
             print(campaign.kill(part))

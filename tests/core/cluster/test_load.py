@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from core.errors import StorageFailure
-from core.postgres import open_database
+from core.store import open_cluster
 from core.store.cluster import Cluster
 from tests.core.cluster.clients import StoreClient
 from tests.core.cluster.load import May, PlaceLoad, check, running
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.postgres
 def store(postgres: Postgres) -> Iterator[Cluster]:
     """With two places."""
     postgres.empty()
-    store = open_database(postgres.address)
+    store = open_cluster(postgres.address)
     lab = store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     lab.enrol([frame("a", "picture 1"), frame("b", "picture 2")])
     yield store

@@ -10,7 +10,7 @@ import pytest
 
 from core.disk.files import disk_errors
 from core.errors import InvalidModel, PlacerecError, StorageFailure, StorageFull
-from core.ledger.outage import Unreachable
+from core.outage import Unreachable
 from service.access.roles import ANONYMOUS, NOBODY, OWNER, Principal
 from service.app.probe import Finding, Probe
 from service.app.runtime import Condition
@@ -67,7 +67,6 @@ def test_a_service_that_is_not_ready_names_addresses_to_those_who_may_know_them(
         Unreachable("Milvus", "cannot be reached: ipv4:10.0.0.3:19530: Failed to connect"),
         KeysUnreadable("/srv/10.0.0.3/keys.sqlite is damaged: a page is torn."),
         InvalidModel("m.safetensors cannot be read: No such file or directory: /srv/10.0.0.3/m.safetensors"),
-        NotReady("No frame can be encoded now: ray://10.0.0.3:10001 is away.", {"encoder": "10.0.0.3"}, "No encoder."),
     ],
     ids=lambda error: f"{type(error).__name__} {str(error)[:24]}",
 )

@@ -7,11 +7,12 @@ import time
 
 from core.method.encoder import Encoder
 from core.threads import allowed_threads
-from service.engine.encoders import Encoded, Encoders, QueuedFrame
+from service.engine.encoder_threads import EncoderThreads
+from service.engine.encoders import Encoded, QueuedFrame
 from tests.service.scenes import jpeg
 
 
-def keep_busy(encoders: Encoders, encoder: Encoder) -> tuple[list[QueuedFrame], threading.Event]:
+def keep_busy(encoders: EncoderThreads, encoder: Encoder) -> tuple[list[QueuedFrame], threading.Event]:
     """Give every thread a frame that it does not finish until the event is set; those frames, and the event."""
     done, begun = threading.Event(), threading.Semaphore(0)
 

@@ -23,7 +23,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.threads import allowed_threads, cores
 from service.engine import encoder_threads
-from service.engine.encoder_threads import MOST_PIXELS, EncoderThreads
+from service.engine.encoder_threads import AHEAD, MOST_PIXELS, EncoderThreads
 from service.engine.encoders import BULK_SHARE, Encoded, QueuedFrame, WaitingFrames
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded
@@ -278,7 +278,6 @@ def queue(catalogue: EncoderCatalogue) -> Iterator[EncoderQueue]:
 
 
 def waiting(queue: EncoderQueue) -> WaitingFrames:
-    assert isinstance(queue.encoders, EncoderThreads)
     return queue.encoders._waiting
 
 
@@ -319,7 +318,7 @@ def test_large_frames_are_more_turns_than_small_ones(watched: Watched) -> None:
 @pytest.mark.thorough
 @pytest.mark.anyio
 async def test_many_frames_of_one_request(queue: EncoderQueue, default: Encoder) -> None:
-    frames = [jpeg(index % 6) for index in range(queue.encoders.ahead + 10)]
+    frames = [jpeg(index % 6) for index in range(AHEAD + 10)]
     frames[4] = b"poison"
     found = await collected(queue, frames, RequestDeadline(time.monotonic() + 60, stays))
     assert sorted(index for index, _ in found) == list(range(len(frames)))
@@ -344,7 +343,7 @@ async def test_waiting_frames_of_an_aborted_request_are_cancelled(queue: Encoder
     if fault is DeadlineExceeded:
         deadline = RequestDeadline(deadline.at, stays)
     with pytest.raises(fault):
-        await collected(queue, [jpeg(0)] * (queue.encoders.ahead + 5), deadline)
+        await collected(queue, [jpeg(0)] * (AHEAD + 5), deadline)
     left = waiting(queue)
     assert not left._robots and left._bulk and all(frame.result.cancelled() for frame in left._bulk.clear())
     free.set()
@@ -358,7 +357,7 @@ async def test_a_frame_that_is_too_late_ends_its_request(queue: EncoderQueue) ->
     await queue.load(identity := EncoderCatalogue().resolve(DEFAULT_ENCODER))
     at = time.monotonic() + 1
     with pytest.raises(DeadlineExceeded):
-        async for _ in queue.encode_many(identity, [jpeg(0)] * (queue.encoders.ahead + 2), RequestDeadline(at, stays)):
+        async for _ in queue.encode_many(identity, [jpeg(0)] * (AHEAD + 2), RequestDeadline(at, stays)):
             await asyncio.sleep(max(0.0, at - time.monotonic()))
             while len(waiting(queue)):
                 await asyncio.sleep(0.01)

@@ -128,7 +128,7 @@ async def test_a_batch_gives_way_as_a_whole_unless_it_is_being_encoded(
 
     first = as_caller("greedy", batch())
     await asyncio.sleep(0)
-    while not queue.waiting or not len(queue.encoders._waiting):  # type: ignore[attr-defined]
+    while not queue.waiting or not len(queue.encoders._waiting):
         await asyncio.sleep(0.001)
     with pytest.raises(QueueFull):  # bulk requests have one place of two, and nobody has more than one
         await as_caller("robot", ask())

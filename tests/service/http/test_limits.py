@@ -14,11 +14,8 @@ ROWS = {name.lower(): test for name, _, _, test in ROW.findall(PAGE.read_text())
 NO_LIMITS = {
     "host", "port", "allow_anonymous", "audit_file", "root_path", "data_dir", "backup_dir", "models_dir", "encoder",
     "threads", "device", "thumbnail_side", "log_level",
-    "vectors", "milvus", "milvus_token", "milvus_certificate", "milvus_database", "database", "row_cache_bytes",
-    "objects", "objects_endpoint", "objects_region", "objects_access_key", "objects_secret_key", "objects_certificate",
-    "ray", "ray_address", "ray_batch", "ray_replicas", "ray_max_replicas", "ray_replica_cpus", "ray_replica_gpus",
-    "ray_scale_seconds", "rehearsal", "allowed_hosts",
-    "event_days", "answer_days", "review_days", "picture_days", "audit_days",
+    "milvus", "milvus_token", "milvus_certificate", "milvus_database", "database", "row_cache_bytes",
+    "rehearsal", "allowed_hosts", "event_days", "answer_days", "review_days", "picture_days", "audit_days",
 }  # fmt: skip
 """Settings that are no limits of what is taken."""
 

@@ -175,7 +175,7 @@ def _endless_picture(manifest: dict[str, Any], parts: Parts) -> None:
 
 
 def test_hostile_files(server: Server, content: bytes) -> None:
-    """One of each kind; ``tests/core/storage/archives`` has them all."""
+    """One of each kind; ``tests/core/store/archives`` has them all."""
     manifest, parts = parts_of(content)
     for made, slug in (
         (b"", "invalid-archive"),

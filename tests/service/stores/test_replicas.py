@@ -1,4 +1,4 @@
-"""Two services on one PostgreSQL and Milvus behind a real nginx, of which one is killed."""
+"""Two services on one PostgreSQL behind a real nginx, of which one is killed."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.servers.milvus import Servers
+from tests.servers.postgres import Postgres
 from tests.service.balancer import balanced
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server, typed
 
 pytestmark = [
-    pytest.mark.cluster,
+    pytest.mark.postgres,
+    pytest.mark.thorough,
     pytest.mark.timeout(600),
     pytest.mark.skipif(shutil.which("nginx") is None, reason="nginx is not installed"),
 ]
 
 
-def test_robots_do_not_notice_that_a_replica_is_killed(servers: Servers, tmp_path: Path) -> None:
+def test_robots_do_not_notice_that_a_replica_is_killed(postgres: Postgres, tmp_path: Path) -> None:
     replicas = []
     for number in range(2):
         folder = tmp_path / f"replica-{number}"
         install_coarse_encoder(folder / "models")
-        addresses = {"milvus": servers.milvus_address, "database": servers.postgres_address}
-        replicas.append(Server(folder, {"vectors": "milvus", "encoder": COARSE, **addresses}))
+        replicas.append(Server(folder, {"encoder": COARSE, "database": postgres.address}))
     for replica in replicas:
         replica.wait()
     front = tmp_path / "nginx"

@@ -7,21 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.servers.milvus import Servers
+from tests.servers.postgres import Postgres
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.map_jobs import asked, places
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 from tests.service.sessions.test_sessions import again, begin, send
 
-pytestmark = [pytest.mark.cluster, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.postgres, pytest.mark.thorough, pytest.mark.timeout(900)]
 
 PLACES = 40
 
 
-def test_a_killed_service(servers: Servers, tmp_path: Path) -> None:
-    settings = {"encoder": COARSE, "vectors": "milvus", "database": servers.postgres_address}
-    settings["milvus"] = servers.milvus_address
+def test_a_killed_service(postgres: Postgres, tmp_path: Path) -> None:
+    settings = {"encoder": COARSE, "database": postgres.address}
     services = []
     for name in ("one", "other"):
         install_coarse_encoder(tmp_path / name / "models")

@@ -14,6 +14,7 @@ from core.maps.archives.lines import MOST_PICTURE_BYTES
 from core.maps.archives.manifest import seal_of
 from core.maps.archives.reading import Archive
 from core.maps.archives.tar_layout import header, padded
+from core.maps.status import no_progress
 from core.store import Map, Store
 
 Parts = dict[str, bytes]
@@ -91,8 +92,16 @@ def _peak() -> int:
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
 
 
-def imported(store: Store, path: Path, map_id: str, most_picture_bytes: int = MOST_PICTURE_BYTES) -> Map:
+def imported(
+    store: Store,
+    path: Path,
+    map_id: str,
+    advance: Callable[[int, int], None] = no_progress,
+    check_picture: Callable[[bytes], None] = lambda _: None,
+    most_picture_bytes: int = MOST_PICTURE_BYTES,
+    before_listing: Callable[[int], None] = lambda _: None,
+) -> Map:
     """The map of a file, listed."""
     with Archive(path) as archive:
-        store.import_map(archive, map_id, lambda *_: None, lambda _: None, most_picture_bytes, lambda _: None)
+        store.import_map(archive, map_id, advance, check_picture, most_picture_bytes, before_listing)
     return store.get(map_id)
