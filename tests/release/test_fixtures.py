@@ -46,6 +46,7 @@ GONE = [
     ),
     *(f"settings: ray{part}" for part in ("", "_address", "_batch", "_max_replicas", "_replica_cpus", "_replica_gpus")),
     *(f"settings: ray{part}" for part in ("_replicas", "_scale_seconds")),
+    "settings: vectors",
     *(f"commands: placerec ray {words}" for words in ("deploy", "deploy --address", "deploy --timeout", "start")),
     *(f"commands: placerec ray {words}" for words in ("status", "status --address")),
     "commands: placerec serve --ray",
