@@ -69,7 +69,7 @@ def fill(directory: Path) -> None:
     """Enrols until a limit on the size of files stops it; then shows that the map still works."""
     atlas = Directory(directory, rows_per_segment=1024)
     lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, resource.RLIM_INFINITY))
     refused = _until_refused(lab)
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     before = lab.count_places()
