@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -35,7 +34,6 @@ from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.maps import Enrolment, MapSettings
-from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
@@ -43,7 +41,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
-from core.store import Directory
+from core.store import Directory, Map
 from core.threads import cores, share_cores
 from lab.training.map_sizes import corridor_and_lip6
 from lab.training.validation import TraverseTask
@@ -164,8 +162,6 @@ def fill(atlas: Directory, name: str, encoder: Encoder, shots: Sequence[tuple[in
     ]
     for start in range(0, len(items), 64):
         made.enrol(items[start : start + 64])
-    while made.index_status().state == "building":
-        time.sleep(0.05)
     return made
 
 
