@@ -13,7 +13,6 @@ from itertools import count
 from pathlib import Path
 
 import pytest
-from core.storage.files.segment_files import HEADER_BYTES
 
 from core.disk.reserve import Reserve
 from core.errors import StorageFailure, StorageFull
