@@ -18,7 +18,7 @@ from core.maps.forms import COMPRESSED
 from core.store import Map, Snapshot, Store, following, recall, snapshot, tiers
 from core.store import map as map_module
 from core.store.rows import RowCache
-from tests.core.store.conftest import OpenStore, execute, on_both
+from tests.core.store.conftest import OpenStore, execute, on_both, table_of
 from tests.core.store.frames import ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 from tests.service.wire import eventually
 
@@ -61,7 +61,7 @@ def codes_are_right(lab: Map) -> bool:
     right = found.table.coder.encode(found.descriptors_at(living))
     with lab.viewing() as (connection, _):
         stored = rows.at(connection, "codes", living.tolist())
-    in_memory = np.array_equal(found.table.codes(0, found.rows)[living], right)
+    in_memory = np.array_equal(table_of(found).codes(0, found.rows)[living], right)
     return in_memory and [stored[row] for row in living.tolist()] == [bytes(code) for code in right]
 
 
@@ -157,9 +157,8 @@ def test_codes_are_joined_while_the_map_grows(
 
     def scanned(lab: Map) -> int:
         """Rows in joined blocks, when the thread that joins them has ended."""
-        assert eventually(lambda: (codes := lab.snapshot().table) is not None and not codes.is_loose, 60)
-        codes = lab.snapshot().table
-        return 0 if codes is None else sum(block.used for block in codes.blocks if block.scan is not None)
+        assert eventually(lambda: not table_of(lab.snapshot()).is_loose, 60)
+        return sum(block.used for block in table_of(lab.snapshot()).blocks if block.scan is not None)
 
     lab = make(store, 70, index="compact")
     assert 32 <= scanned(lab) <= 70
@@ -275,7 +274,7 @@ def test_damaged_and_missing_codes_are_made_again(
         found = lab.snapshot()
     assert "The codes of 3 rows of map lab are damaged and made again" in caplog.text
     assert store.quarantined() == {} and found.table is not None
-    codes, right = found.table.codes(0, PLACES), found.table.coder.encode(found.descriptors_at(np.arange(PLACES)))
+    codes, right = table_of(found).codes(0, PLACES), found.table.coder.encode(found.descriptors_at(np.arange(PLACES)))
     assert np.flatnonzero((codes != right).any(axis=1)).tolist() == [3], "another's, with its own checksum"
     lab.rebuild_index()
     report = lab.verify()
