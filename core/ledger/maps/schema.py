@@ -202,6 +202,8 @@ _STATISTICS = {
     ("sequences", "sequences"): "200 200 1",
     ("sequences", "sqlite_autoindex_sequences_2"): "200 200 1",  # by name
     ("tokens", "tokens"): "2000000 2000000 1000 1",
+    ("review_frames", "sqlite_autoindex_review_frames_1"): "500 500 1",  # by number
+    ("review_frames", "sqlite_autoindex_review_frames_2"): "500 500 1",  # by digest
 }
 _MORE = [
     "ANALYZE sqlite_schema",  # makes the table of statistics
