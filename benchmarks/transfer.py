@@ -19,7 +19,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from core.storage.archives.building import build
 
 from benchmarks.process import peak_memory
 from benchmarks.report import report
@@ -64,8 +63,7 @@ def measured(folder: Path) -> dict[str, float]:
     with Archive(made.path) as archive:
         check(archive)
         checked = time.perf_counter()
-        with atlas.building("copy") as unfinished:
-            build(archive, unfinished, "copy")
+        atlas.import_map(archive, "copy", lambda _done, _all: None, lambda _picture: None, 1 << 20, lambda _count: None)
     built = time.perf_counter()
     found = {
         "file": made.size / 1e6,

@@ -132,8 +132,6 @@ def storage(places: int, found: Times, drives: int) -> None:
             stores[name] = made[0]
             stack.callback(made[0].close)
         maps = {name: store.get("drive") for name, store in stores.items()}
-        while maps["files"].index_status().state == "building":
-            time.sleep(0.1)
         first = {name: [int(searched(maps[name], query)[0]) for query in queries[:1]] for name in ENGINES}
         assert first["files"] == first["postgres"]
         for drive in range(drives):

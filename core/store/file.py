@@ -258,12 +258,12 @@ class MapFile:
         self._open_files.touch(self)
 
     def rest(self) -> bool:
-        """Close the file until its next use; False if it is in use."""
+        """Close the file until its next use; False if it is in use, or would come back with a write that was undone."""
         if not self._lock.acquire(blocking=False):
             return False
         try:
             with self._condition:
-                if self._using:
+                if self._using or self._doubtful:
                     return False
                 self._close_connections()
                 self._open_files.drop(self)

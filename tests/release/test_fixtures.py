@@ -40,20 +40,21 @@ from tests.release.surface import broken, interface, missing
 from tests.service.server import ROOT, Server
 
 GONE = [
-    "metrics: placerec_indexes_building",
     *(
         f"settings: objects{part}"
         for part in ("", "_access_key", "_certificate", "_endpoint", "_region", "_secret_key")
     ),
     *(f"settings: ray{part}" for part in ("", "_address", "_batch", "_max_replicas", "_replica_cpus", "_replica_gpus")),
     *(f"settings: ray{part}" for part in ("_replicas", "_scale_seconds")),
+    "settings: vectors",
     *(f"commands: placerec ray {words}" for words in ("deploy", "deploy --address", "deploy --timeout", "start")),
     *(f"commands: placerec ray {words}" for words in ("status", "status --address")),
     "commands: placerec serve --ray",
+    "metrics: placerec_indexes_building",
 ]
 """The names of 1.0 that 2.0 does not have."""
 
-GONE_FROM_INTERFACE = ["IndexStatus has no problem", "IndexStatus has no progress"]
+GONE_FROM_INTERFACE = [f"IndexStatus {lacks}" for lacks in ("has no problem", "has no progress", "may lack progress")]
 """What 2.0 does not say any more: no index is built in the background."""
 
 RELEASES = sorted(path for path in FIXTURES.iterdir() if path.is_dir())

@@ -12,14 +12,14 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import UnknownMap, UnknownPlace
-from core.index import Coder, Codes, CodeTable, table
+from core.index import Coder, Codes, table
 from core.ledger.maps import rows, writing
 from core.maps import MapSettings
 from core.maps.forms import COMPRESSED
 from core.store import Map, Snapshot, Store, following, recall, snapshot, tiers
 from core.store import map as map_module
 from core.store.rows import RowCache
-from tests.core.store.conftest import OpenStore, execute, on_both
+from tests.core.store.conftest import OpenStore, execute, on_both, table_of
 from tests.core.store.frames import ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 from tests.service.wire import eventually
 
@@ -52,12 +52,6 @@ def finds(lab: Map, place_id: str, shown: str | None = None) -> bool:
     assert (np.diff(products) <= 0).all()
     same = np.array_equal(found.locals_at(ranked[:1])[0], local_of(shown or place_id))
     return place is not None and place.id == place_id and same
-
-
-def table_of(found: Snapshot) -> CodeTable:
-    """The codes of a snapshot that are in memory."""
-    assert isinstance(found.table, CodeTable)
-    return found.table
 
 
 def codes_are_right(lab: Map) -> bool:

@@ -12,12 +12,12 @@ import psycopg
 import pytest
 
 from core.errors import StoreUnavailable, UnknownPlace
-from core.index import CodeTable
 from core.maps.records import COMPACT_FROM, Enrolment, MapSettings, TierSetting
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
 from core.store import Map
 from core.store.cluster import Cluster
+from tests.core.store.conftest import table_of
 from tests.servers.postgres import Postgres
 from tests.service.wire import eventually
 
@@ -72,8 +72,8 @@ def expect_alike(one: Map, address: str) -> None:
         np.testing.assert_array_equal(held.descriptors_at(rows), read.descriptors_at(rows))
         np.testing.assert_array_equal(held.locals_at(rows), read.locals_at(rows))
         assert (held.holds, held.table is None) == (read.holds, read.table is None)
-        if isinstance(held.table, CodeTable) and isinstance(read.table, CodeTable):
-            codes = held.table.codes(0, held.rows), read.table.codes(0, read.rows)
+        if held.table is not None:
+            codes = table_of(held).codes(0, held.rows), table_of(read).codes(0, read.rows)
             np.testing.assert_array_equal(codes[0][rows], codes[1][rows])
     finally:
         fresh.close()
