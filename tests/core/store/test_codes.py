@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import weakref
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,12 +57,13 @@ def finds(lab: Map, place_id: str, shown: str | None = None) -> bool:
 def codes_are_right(lab: Map) -> bool:
     """Whether what is searched by, and what is stored, is what the stored descriptors give."""
     found = lab.snapshot()
-    assert found.table is not None and found.coded == found.rows
+    codes = table_of(found)
+    assert found.coded == found.rows
     living = np.flatnonzero(found.alive)
-    right = found.table.coder.encode(found.descriptors_at(living))
+    right = codes.coder.encode(found.descriptors_at(living))
     with lab.viewing() as (connection, _):
         stored = rows.at(connection, "codes", living.tolist())
-    in_memory = np.array_equal(table_of(found).codes(0, found.rows)[living], right)
+    in_memory = np.array_equal(codes.codes(0, found.rows)[living], right)
     return in_memory and [stored[row] for row in living.tolist()] == [bytes(code) for code in right]
 
 
@@ -244,7 +246,7 @@ def test_a_start_reads_codes_and_makes_none(
 
 @on_both
 def test_damaged_and_missing_codes_are_made_again(
-    open_store: OpenStore, store: Store, caplog: pytest.LogCaptureFixture
+    open_store: OpenStore, store: Store, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They are no reason to put a map out of service."""
     lab = make(store, index="compact")
@@ -268,13 +270,20 @@ def test_damaged_and_missing_codes_are_made_again(
     assert report.ok and len(report.stale_caches) == 3
     assert all(f"the code of place 'p{row}' does not match" in " ".join(report.stale_caches) for row in (8, 9, 10))
     store.close()
+    computed, encode = [], following.FollowedMap._encode
+
+    def encoded(self: following.FollowedMap, *arguments: Any) -> None:
+        computed.append(arguments[3])
+        encode(self, *arguments)
+
+    monkeypatch.setattr(following.FollowedMap, "_encode", encoded)
     store = open_store()
-    lab = store.get("lab")
     with caplog.at_level(logging.ERROR):
+        lab = store.get("lab")
         found = lab.snapshot()
     assert "The codes of 3 rows of map lab are damaged and made again" in caplog.text
-    assert store.quarantined() == {} and found.table is not None
-    codes, right = table_of(found).codes(0, PLACES), found.table.coder.encode(found.descriptors_at(np.arange(PLACES)))
+    assert store.quarantined() == {} and computed == [[5, 7, 8, 9, 10]]
+    codes, right = table_of(found).codes(0, PLACES), Coder.of(DIMENSION).encode(found.descriptors_at(np.arange(PLACES)))
     assert np.flatnonzero((codes != right).any(axis=1)).tolist() == [3], "another's, with its own checksum"
     lab.rebuild_index()
     report = lab.verify()

@@ -25,7 +25,7 @@ def run_together(*works: Callable[[], None]) -> None:
 @pytest.mark.thorough
 @on_both
 def test_writers_and_searchers(lab: Map) -> None:
-    """What a writer was told is seen at once by whoever looks next; nobody sees half a write."""
+    """A write that has returned is seen by every later search; nobody sees half of one."""
     writing = threading.Event()
     writers, each = 4, 15
     left = [writers]

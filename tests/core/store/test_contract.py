@@ -1,4 +1,4 @@
-"""Both stores do what is asked of every store."""
+"""Both stores hold the contract of all stores."""
 
 from __future__ import annotations
 

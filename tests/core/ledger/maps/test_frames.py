@@ -130,7 +130,7 @@ def same(found: Keypoints | None, expected: Keypoints | None) -> bool:
     return found.record() == expected.record()
 
 
-def kept(map_: Map, place_id: str) -> Keypoints | None:
+def keypoints_in(map_: Map, place_id: str) -> Keypoints | None:
     (row,) = map_.rows_of([place_id])
     assert row is not None
     return map_.keypoints_at([row])[0]
@@ -176,7 +176,7 @@ def test_they_are_those_of_the_frame(lab: Map, steps: Sequence[Step], expected: 
     lab.enrol([frame("a")])
     for step in steps:
         step(lab)
-    assert same(kept(lab, "a"), None if expected is None else keypoints_of(expected))
+    assert same(keypoints_in(lab, "a"), None if expected is None else keypoints_of(expected))
     with lab._transaction() as connection:
         assert frames.room(connection)[0] == (expected is not None)
     assert lab.verify().ok
@@ -203,13 +203,13 @@ def test_places_without_are_listed_a_page_at_a_time_and_filled_in(lab: Map) -> N
     lab.enrol([frame("a"), bare("b"), bare("c"), replace(bare("d"), image=None, thumbnail=None), bare("e")])
     first = lab.without_keypoints(0, 2)
     second = lab.without_keypoints(first[-1].number, 2)
-    assert [place.id for place in (*first, *second)] == ["b", "c", "e"], "nothing is kept of d"
+    assert [place.id for place in (*first, *second)] == ["b", "c", "e"], "no picture of d is stored"
     assert (first[0].picture, first[0].digest, first[0].camera) == ("thumbnail", bare("b").digest, None)
     lab.forget("c")
     lab.enrol([bare("e", "other")])
     found = [(place, keypoints_of(place.id)) for place in (*first, *second)]
     assert lab.add_keypoints(found) == 1, "c is gone, and e shows another frame"
-    assert same(kept(lab, "b"), keypoints_of("b")) and kept(lab, "e") is None
+    assert same(keypoints_in(lab, "b"), keypoints_of("b")) and keypoints_in(lab, "e") is None
     assert lab.add_keypoints(found) == 0
     assert [place.id for place in lab.without_keypoints(0, 9)] == ["e"]
     lab.edit({"verification": False})
