@@ -12,12 +12,13 @@ import psycopg
 import pytest
 
 from core.errors import StoreUnavailable, UnknownPlace
+from core.index import CodeTable
 from core.maps.records import COMPACT_FROM, Enrolment, MapSettings, TierSetting
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
-from core.store import Map
+from core.store import Map, following
 from core.store.cluster import Cluster
-from tests.core.store.conftest import table_of
+from core.store.rows import RowCache
 from tests.servers.postgres import Postgres
 from tests.service.wire import eventually
 
@@ -71,9 +72,9 @@ def expect_alike(one: Map, address: str) -> None:
             np.testing.assert_array_equal(column, getattr(held.whereabouts.take(rows), name), err_msg=name)
         np.testing.assert_array_equal(held.descriptors_at(rows), read.descriptors_at(rows))
         np.testing.assert_array_equal(held.locals_at(rows), read.locals_at(rows))
-        assert (held.holds, held.table is None) == (read.holds, read.table is None)
-        if held.table is not None:
-            codes = table_of(held).codes(0, held.rows), table_of(read).codes(0, read.rows)
+        assert (held.holds, type(held.table)) == (read.holds, type(read.table))
+        if isinstance(held.table, CodeTable) and isinstance(read.table, CodeTable):
+            codes = held.table.codes(0, held.rows), read.table.codes(0, read.rows)
             np.testing.assert_array_equal(codes[0][rows], codes[1][rows])
     finally:
         fresh.close()
@@ -229,3 +230,51 @@ def test_a_restore_to_an_earlier_moment_forgets_all_that_was_held(
     finally:
         with psycopg.connect(empty.address.replace("/postgres", "/template1"), autocommit=True) as connection:
             connection.execute("DROP DATABASE later")
+
+
+def test_codes_are_read_and_not_computed_and_made_again_where_they_are_damaged(
+    stores: list[Cluster], empty: Postgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, there = maps_of(stores)
+    here.enrol([frame(f"p{number}", number + 1) for number in range(300)])
+    with psycopg.connect(empty.address) as connection:
+        connection.execute("UPDATE codes SET bytes = set_byte(bytes, 0, get_byte(bytes, 0) # 255) WHERE row = 7")
+        connection.execute("DELETE FROM codes WHERE row = 8")
+    computed, encode = [], following.FollowedMap._encode
+
+    def encoded(self: following.FollowedMap, *arguments: Any) -> None:
+        computed.append(arguments[3])
+        encode(self, *arguments)
+
+    monkeypatch.setattr(following.FollowedMap, "_encode", encoded)
+    snapshot = there.snapshot()
+    assert computed == [[7, 8]]
+    assert isinstance(snapshot.table, CodeTable)
+    right = snapshot.table.coder.encode(snapshot.descriptors_at(np.arange(300)))
+    np.testing.assert_array_equal(snapshot.table.codes(0, 300), right)
+    report = stores[0].verify("lab")
+    assert report.ok and "p7" in report.stale_caches[0] and "rebuild the index" in report.stale_caches[0]
+    there.rebuild_index()
+    report = stores[0].verify("lab")
+    assert report.ok and not report.stale_caches
+    expect_alike(there, empty.address)
+
+
+def test_rows_are_read_once_and_the_cache_stays_within_its_bytes(stores: list[Cluster]) -> None:
+    here, there = maps_of(stores)
+    here.edit({"index": "compact"})
+    here.enrol([frame(f"p{number}", number + 1) for number in range(300)])
+    snapshot = there.snapshot()
+    assert not snapshot.holds
+    cache = stores[1]._cache
+    before = cache.misses
+    snapshot.locals_at(np.arange(50))
+    misses, hits = cache.misses, cache.hits
+    assert misses == before + 50
+    snapshot.locals_at(np.arange(50))
+    assert (cache.misses, cache.hits) == (misses, hits + 50)
+    small = RowCache(1000)
+    for number in range(100):
+        small.put({number: bytes(100)})
+        assert small.size <= 1000
+    assert 0 < len(small) < 10 and not small.get([0]) and small.get([99])
