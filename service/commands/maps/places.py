@@ -26,9 +26,7 @@ from service.commands.jobs import followed, submit
 
 places = typer.Typer(cls=Commands, help="List, show, edit and delete the places of a map.", no_args_is_help=True)
 
-Erase = Annotated[
-    bool, typer.Option("--erase", help="Also erase what is left of them, and discard frames for review.")
-]
+Erase = Annotated[bool, typer.Option("--erase", help="Also erase what is left of them, and discard frames for review.")]
 PlaceId = Annotated[str, typer.Argument(metavar="PLACE", help="The place's id.", show_default=False)]
 CLEARED = ("pose", "pose_accuracy", "timestamp", "sequence", "level", "metadata")
 COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
