@@ -86,6 +86,7 @@ PARTS = {
     "verification": Part("benchmarks.geometry.requests", "--data {data}", "data sets"),
     "enrolment": Part("benchmarks.enrolment"),
     "start": Part("benchmarks.startup"),
+    "store": Part("benchmarks.maps.store"),
     "small-maps": Part("benchmarks.maps.small_maps"),
     "access": Part("benchmarks.access"),
     "installation": Part("benchmarks.installation", "HEAD"),

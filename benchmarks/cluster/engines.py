@@ -28,11 +28,10 @@ from numpy.typing import NDArray
 from benchmarks.checkouts import BATCH, ROOT, enrol, load, running
 from benchmarks.frames import camera_frames
 from benchmarks.report import report, verdict
-from core.store import Map, Store
 from core.maps.records import Enrolment, MapSettings
 from core.places import PlaceFields
+from core.store import Directory, Map, Store
 from core.store.cluster import Cluster
-from core.store import Directory
 from core.threads import cores, share_cores
 from tests.servers.postgres import running_postgres
 
@@ -133,8 +132,6 @@ def storage(places: int, found: Times, drives: int) -> None:
             stores[name] = made[0]
             stack.callback(made[0].close)
         maps = {name: store.get("drive") for name, store in stores.items()}
-        while maps["files"].index_status().state == "building":
-            time.sleep(0.1)
         first = {name: [int(searched(maps[name], query)[0]) for query in queries[:1]] for name in ENGINES}
         assert first["files"] == first["postgres"]
         for drive in range(drives):

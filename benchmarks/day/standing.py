@@ -34,7 +34,6 @@ from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.maps import Enrolment, MapSettings
-from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
@@ -42,7 +41,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
-from core.store import Directory
+from core.store import Directory, Map
 from core.threads import cores, share_cores
 from lab.training.map_sizes import corridor_and_lip6
 from lab.training.validation import TraverseTask

@@ -19,7 +19,6 @@ from benchmarks.day.pictures import Look, cut, file, portrait
 from benchmarks.day.walks import WalkPair, corridor, lip6, pixels
 from benchmarks.report import report
 from core.frames.intrinsics import Intrinsics
-from core.store import Map
 from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -27,7 +26,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.framings import FrameReframing
 from core.recognition.question import Question, Verify
 from core.recognition.recognition import enrol, recognize
-from core.store import Directory
+from core.store import Directory, Map
 
 CUT, RANDOM = cut(0.6, 0.6), np.random.default_rng(0)
 KINDS: dict[str, tuple[Look | None, str | None]] = {

@@ -26,7 +26,6 @@ from core.frames.images import decode
 from core.frames.traverses import find_images, read_ground_truth
 from core.geometry.detection import find_keypoints
 from core.judgement.curves import auc_pr
-from core.store import Map
 from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -35,7 +34,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question, Verify
 from core.recognition.recognition import Answer, describe
 from core.recognition.rigs import locate_rig
-from core.store import Directory
+from core.store import Directory, Map
 
 WAYS: tuple[Verify, ...] = ("never", "auto", "always")
 TRAVERSES = {"corridor": ("corridor", "query", "ref"), "lip6": ("lip6_outdoor", "query", "reference")}

@@ -32,12 +32,11 @@ from core.judgement.trials import StagedTrials, joined_stages
 from core.judgement.verdict import Calibration
 from core.learning import PlacedFrame, lesson_of, placed_frames, trials_of
 from core.maps import Enrolment, MapSettings
-from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.calibration import LabelledQueries, LabelledQuery, run_trials
-from core.store import Directory
+from core.store import Directory, Map
 from service.maps.self_calibration import LEAST_FRAMES
 
 FIRST = 900

@@ -48,7 +48,6 @@ from core.judgement.change import (
 )
 from core.judgement.probability import sigmoid
 from core.maps import Enrolment, MapSettings
-from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
@@ -56,7 +55,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, answer_to_blank, locate
 from core.recognition.stages import neighborhood_of
-from core.store import Directory
+from core.store import Directory, Map
 from lab.training.photographs import find_photographs, read
 from service.learning.adoption import graph_of
 

@@ -19,14 +19,13 @@ from benchmarks.report import report
 from core.errors import CalibrationImpossible
 from core.judgement.calibration import Held, Target, fit_map_calibration
 from core.judgement.trials import StagedTrials
-from core.store import Map
 from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields, Pose
 from core.recognition.calibration import queries_from_traverse, run_trials
 from core.recognition.recognition import enrol
-from core.store import Directory
+from core.store import Directory, Map
 
 WALKS = {"corridor": corridor, "lip6": lip6}
 MOST_QUERIES = 300

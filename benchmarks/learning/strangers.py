@@ -36,7 +36,6 @@ from core.judgement.background import GUARD_FACTOR
 from core.learning import least_score
 from core.learning.cohort import CLEAR
 from core.maps import Enrolment, MapSettings
-from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
@@ -44,7 +43,7 @@ from core.places import PlaceFields, Pose, look_address
 from core.recognition.question import Query, Question
 from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
-from core.store import Directory
+from core.store import Directory, Map
 from service.learning.adoption import graph_of, likeness_of_encodings
 
 LOOKS = (1, 3, 10)

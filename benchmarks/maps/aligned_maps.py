@@ -29,13 +29,13 @@ from numpy.typing import NDArray
 from benchmarks.report import report, verdict
 from core.frames.preprocessing import Pixels
 from core.maps import Enrolment, MapSettings
-from core.store import Map
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.method.regions import Regions
 from core.places import PlaceFields
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
+from core.store import Map
 from core.threads import share_cores
 from lab.training.calibration_quality import widened
 from lab.training.map_sizes import STRETCHES, corridor_and_lip6

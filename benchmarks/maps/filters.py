@@ -2,7 +2,7 @@
 
     python -m benchmarks.maps.filters [--places 100000] [--rounds 15] [--keep FOLDER]
 
-The map is written through the storage, of descriptors mixed from those of sample frames, and
+The map is written through the store, of descriptors mixed from those of sample frames, and
 every place has a pose, a heading, a time, a sequence and metadata.  Measured is all that a query takes after its
 encoding (what may be found, search, second stage, verdict, look-up), for every kind of filter in turn, so that all see
 the same machine; given are medians, and that of the ratio to the same query unfiltered.  ``--keep`` is where the map
@@ -21,7 +21,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from benchmarks.maps.opening import built
 from benchmarks.process import median
 from benchmarks.report import report, verdict
 from core.maps.selection import Selection
@@ -130,7 +129,6 @@ def main(
         atlas = Directory(folder)
         stack.callback(atlas.close)
         map_ = atlas.get(MAP)
-        built(map_)
         tier = map_.index_status().tier
         figures = measured(map_, encoder, rounds)
         places = map_.count_places()

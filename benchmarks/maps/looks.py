@@ -27,14 +27,13 @@ from core.frames.images import decode
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.maps import Enrolment, Selection
-from core.store import Map
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import PlaceFields, look_address
 from core.recognition.question import Query, Question
 from core.recognition.recognition import locate
-from core.store import Directory
+from core.store import Directory, Map
 
 LOOKS = (0, 1, 3, 10)
 """How many looks a place has besides its first."""

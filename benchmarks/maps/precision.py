@@ -32,10 +32,6 @@ from benchmarks.frames import encode_folder
 from benchmarks.report import report
 from core.frames.traverses import Truth, read_ground_truth
 from core.judgement.curves import auc_pr
-from core.maps.records import Precision
-from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from core.method.encoder import Encoder
-from core.recognition.stages import score_matrix
 from core.maps.forms import (
     BLOCK,
     COMPRESSED,
@@ -45,6 +41,10 @@ from core.maps.forms import (
     unpack_descriptors,
     unpack_local,
 )
+from core.maps.records import Precision
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
+from core.recognition.stages import score_matrix
 
 Side = tuple[NDArray[np.float32], NDArray[np.int8]]
 """Descriptors float32 [n, D] and local descriptors int8 [n, C, L]."""

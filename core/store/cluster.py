@@ -8,6 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
 
 from core.errors import MapExists, StorageFailure, UnknownMap
 from core.ledger import Lock
@@ -42,6 +43,9 @@ WAIT_SECONDS = 10
 
 WRITING = 7061
 """The kind of the locks of the database by which writes to a map are paused; their number is that of the map."""
+
+if TYPE_CHECKING:
+    from core.index.milvus import Milvus
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +124,13 @@ class MapRows:
 class Cluster(Store):
     """All maps of a PostgreSQL database, searched by FAISS in the memory of each service."""
 
-    def __init__(self, address: str, cache_bytes: int = BYTES, rows_per_segment: int = ROWS_PER_SEGMENT) -> None:
+    def __init__(
+        self,
+        address: str,
+        cache_bytes: int = BYTES,
+        rows_per_segment: int = ROWS_PER_SEGMENT,
+        milvus: Milvus | None = None,
+    ) -> None:
         """Remember where PostgreSQL is; it is connected to when it is first used.
 
         Its tables are made if they are missing.
@@ -129,8 +139,9 @@ class Cluster(Store):
             address: such as ``postgresql://placerec@localhost/placerec``.
             cache_bytes: most bytes of rows that are kept in memory.
             rows_per_segment: of snapshots.
+            milvus: has the codes of large maps; None: memory has those of all.
         """
-        self._rows_per_segment = rows_per_segment
+        self._rows_per_segment, self.milvus = rows_per_segment, milvus
         self._maps: OrderedDict[int, Map] = OrderedDict()
         self._making = threading.Lock()
         self._closed = threading.Event()
@@ -187,7 +198,7 @@ class Cluster(Store):
             found = self._maps.get(state.number)
             if found is None:
                 rows = MapRows(self.database, state.number)
-                found = self._maps[state.number] = Map(rows, state, self._cache, self._rows_per_segment)
+                found = self._maps[state.number] = Map(rows, state, self._cache, self.milvus, self._rows_per_segment)
                 while len(self._maps) > MOST_MAPS:
                     self._maps.popitem(last=False)
             self._maps.move_to_end(state.number)
@@ -240,6 +251,8 @@ class Cluster(Store):
         """
         self._expect_open()
         self.database.check()
+        if self.milvus is not None:
+            self.milvus.check()
 
     @property
     def open_maps(self) -> int:
@@ -297,6 +310,7 @@ class Cluster(Store):
             record.delete_map(connection)
         with self._making:
             self._maps.pop(found.number, None)
+        self._drop_codes(found.record)
 
     def close(self) -> None:
         """Close the connections, and refuse further reads and writes."""

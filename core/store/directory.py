@@ -16,6 +16,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from core.disk.files import Damage, FolderLock, check_writable, disk_errors, make_folder, sync_folder, write_file
 from core.disk.permissions import PRIVATE_FOLDER
@@ -38,6 +39,9 @@ from core.store.map import Map
 from core.store.rows import RowCache
 from core.store.store import Store
 from core.store.verification import inspect
+
+if TYPE_CHECKING:
+    from core.index.milvus import Milvus
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +75,7 @@ class Directory(Store):
         most_open: int = MOST_OPEN,
         cache_bytes: int = CACHE_BYTES,
         rows_per_segment: int = ROWS_PER_SEGMENT,
+        milvus: Milvus | None = None,
     ) -> None:
         """Lock the directory, make it if it is missing, and read the record of every map.
 
@@ -78,6 +83,7 @@ class Directory(Store):
             most_open: maps that are open together; those used least are closed for others.
             cache_bytes: most bytes of rows that are kept in memory.
             rows_per_segment: of snapshots.
+            milvus: has the codes of large maps; None: memory has those of all.
 
         Raises:
             DataDirectoryLocked: another process uses it.
@@ -87,11 +93,8 @@ class Directory(Store):
         """
         self._directory = directory
         self._folder = directory / _MAPS
-        self._rows_per_segment, self._cache, self._open_files = (
-            rows_per_segment,
-            RowCache(cache_bytes),
-            OpenFiles(most_open),
-        )
+        self._rows_per_segment, self._cache = rows_per_segment, RowCache(cache_bytes)
+        self._open_files, self.milvus = OpenFiles(most_open), milvus
         self._making = threading.Lock()  # held while a map is made or deleted
         self._maps: dict[str, Map] = {}
         self._unlisted: dict[str, Map] = {}
@@ -198,7 +201,7 @@ class Directory(Store):
                 raise Damage(f"{FILE}: it belongs to the map {state.record.id!r}")
         finally:
             file.rest()
-        made = Map(file, state, self._cache, self._rows_per_segment)
+        made = Map(file, state, self._cache, self.milvus, self._rows_per_segment)
         file.rested = made.rest
         return made
 
@@ -383,6 +386,8 @@ class Directory(Store):
             self._refused.pop(map_id, None)
         # Files that cannot be deleted now are deleted at the next start.
         shutil.rmtree(removed, ignore_errors=True)
+        if found is not None:
+            self._drop_codes(found.record)
 
     def check_writable(self) -> None:
         """Write, sync and delete a small file, to see that maps could be written.
@@ -392,6 +397,8 @@ class Directory(Store):
         """
         self._expect_open()
         check_writable(self._directory)
+        if self.milvus is not None:
+            self.milvus.check()
 
     @property
     def open_maps(self) -> int:

@@ -19,7 +19,7 @@ from core.disk.files import Damage, disk_errors, is_full, sync_file, sync_folder
 from core.disk.permissions import PRIVATE_FOLDER
 from core.disk.sqlite_file import DURABLE, NotOurs, Schema, UnreadVersion, rewrite, transaction
 from core.disk.write_ahead_log import check_log
-from core.errors import MapBusy, UnknownMap
+from core.errors import MapBusy
 from core.ledger.maps import record
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
@@ -258,12 +258,12 @@ class MapFile:
         self._open_files.touch(self)
 
     def rest(self) -> bool:
-        """Close the file until its next use; False if it is in use."""
+        """Close the file until its next use; False if it is in use, or would come back with a write that was undone."""
         if not self._lock.acquire(blocking=False):
             return False
         try:
             with self._condition:
-                if self._using:
+                if self._using or self._doubtful:
                     return False
                 self._close_connections()
                 self._open_files.drop(self)
@@ -298,11 +298,8 @@ class MapFile:
         Raises:
             Damage: it is not a map, or another one than its folder says.
         """
-        try:
-            with self.glancing() as connection:
-                return record.state_of(connection, self.folder.name)
-        except UnknownMap as error:
-            raise Damage(f"{FILE} has no record of a map") from error
+        with self.glancing() as connection:
+            return record.state_of(connection, self.folder.name)
 
     def room(self) -> int:
         """The bytes of the file and its log."""

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from core.disk.files import Damage
 from core.errors import MapBusy, MapQuarantined, PlacerecError, StorageFailure, UnknownMap
@@ -42,6 +43,9 @@ from core.store.scopes import Chooser
 from core.store.snapshot import Scope, Snapshot
 from core.store.tiers import holds_for, tier_for
 from core.store.verification import damage_of_places, inspect
+
+if TYPE_CHECKING:
+    from core.index.milvus import Milvus
 
 log = logging.getLogger(__name__)
 
@@ -90,15 +94,21 @@ class Map(LedgerMap):
         database: of the map.
         state: in which it was found.
         cache: of rows of all maps.
+        milvus: has the codes of large maps; None: memory has those of all.
         rows_per_segment: of its snapshots.
     """
 
     def __init__(
-        self, database: MapDatabase, state: MapState, cache: RowCache, rows_per_segment: int = ROWS_PER_SEGMENT
+        self,
+        database: MapDatabase,
+        state: MapState,
+        cache: RowCache,
+        milvus: Milvus | None = None,
+        rows_per_segment: int = ROWS_PER_SEGMENT,
     ) -> None:
         self.database, self._state, self._cache = database, state, cache
         self._noted = (-1.0, state)  # the last state that was read, and when it was asked for
-        self._followed = FollowedMap(database, self._glancing, cache, rows_per_segment)
+        self._followed = FollowedMap(database, self._glancing, cache, milvus, rows_per_segment)
         self._room: tuple[object, StorageStatus] | None = None
         self._recent_places = RecentPlaces()
         self._damage: str | None = None
@@ -361,7 +371,9 @@ class Map(LedgerMap):
                 threading.Event().wait(0.05 if not self.database.shared else 1)
         with self._guarded():
             freed = self.database.erase()
-        self._followed.forget()  # what is in memory still has them
+        with self._reading() as connection:
+            dead = rows.dead_since(connection, -1)
+        self._followed.erase(self.record, dead)
         self._room = None
         return ErasureReport(rows=total, bytes=freed)
 

@@ -35,7 +35,7 @@ NOT_COMPUTING = (
     "core/index/",
     "core/outage.py",
     "core/recordings/",
-    "core/storage/",
+    "core/store/",
     "core/upkeep/",
     "lab/commands/",
     "lab/conversion/",

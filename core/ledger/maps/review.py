@@ -220,9 +220,10 @@ class Review:
         """
         with self._reading() as connection:
             frame, stored = _frame(_expect(connection, number)), connection.one(_PICTURE, number=number)
-        if stored is None or hashlib.sha256(stored[0]).digest() != frame.digest:
+        content = None if stored is None else stored[0]
+        if not isinstance(content, bytes) or hashlib.sha256(content).digest() != frame.digest:
             raise StorageFailure(f"The picture of the frame {number} is damaged; discard the frame.")
-        return bytes(stored[0])
+        return content
 
     @contextmanager
     def held(self, number: int) -> Iterator[None]:

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from core.storage.database.connections import FILE
 
 from core.disk.files import Damage
 from core.disk.write_ahead_log import check_log

@@ -9,9 +9,10 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from core.index import CodeTable
 from core.ledger.maps import rows
 from core.maps import MapSettings
-from core.store import Directory, Map, Store
+from core.store import Directory, Map, Snapshot, Store
 from core.store.cluster import Cluster
 from core.store.file import MapFile
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE
@@ -69,6 +70,13 @@ def store(open_store: OpenStore) -> Store:
 
 
 @pytest.fixture
+def atlas(store: Store) -> Directory:
+    """The store of a test that is about a data directory."""
+    assert isinstance(store, Directory)
+    return store
+
+
+@pytest.fixture
 def lab(store: Store) -> Map:
     return store.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)
 
@@ -77,6 +85,12 @@ def lab(store: Store) -> Map:
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have what no place names any more deleted with the write by which it died, and not a while later."""
     monkeypatch.setattr(rows, "LEFT_SECONDS", -1)  # clocks of databases are coarse
+
+
+def table_of(snapshot: Snapshot) -> CodeTable:
+    """The codes of a map in memory."""
+    assert isinstance(snapshot.table, CodeTable)
+    return snapshot.table
 
 
 def execute(map_: Map, *statements: str) -> None:

@@ -17,7 +17,8 @@ from core.maps import MapSettings
 from core.maps.forms import COMPRESSED
 from core.store import Map, Snapshot, Store, following, recall, snapshot, tiers
 from core.store import map as map_module
-from tests.core.store.conftest import OpenStore, execute, on_both
+from core.store.rows import RowCache
+from tests.core.store.conftest import OpenStore, execute, on_both, table_of
 from tests.core.store.frames import ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 from tests.service.wire import eventually
 
@@ -60,7 +61,7 @@ def codes_are_right(lab: Map) -> bool:
     right = found.table.coder.encode(found.descriptors_at(living))
     with lab.viewing() as (connection, _):
         stored = rows.at(connection, "codes", living.tolist())
-    in_memory = np.array_equal(found.table.codes(0, found.rows)[living], right)
+    in_memory = np.array_equal(table_of(found).codes(0, found.rows)[living], right)
     return in_memory and [stored[row] for row in living.tolist()] == [bytes(code) for code in right]
 
 
@@ -89,7 +90,7 @@ def test_a_map_becomes_compact_and_exact_again(store: Store) -> None:
     assert [one() for one in held] == [None] * len(held), "descriptors in memory are given up"
     status = lab.index_status()
     assert (status.setting, status.tier, status.wanted) == ("compact", "compact", "compact")
-    assert (status.rows_indexed, status.progress, status.recall) == (PLACES, 1.0, None)
+    assert (status.rows_indexed, status.recall) == (PLACES, None)
     in_memory = DIMENSION * 2 + LOCAL_SHAPE[0] * LOCAL_SHAPE[1]
     room = table.ROWS_PER_BLOCK * (DIMENSION // 8 + 8)
     assert status.bytes_in_memory <= before.bytes_in_memory - PLACES * in_memory + room
@@ -156,9 +157,8 @@ def test_codes_are_joined_while_the_map_grows(
 
     def scanned(lab: Map) -> int:
         """Rows in joined blocks, when the thread that joins them has ended."""
-        assert eventually(lambda: (codes := lab.snapshot().table) is not None and not codes.is_loose, 60)
-        codes = lab.snapshot().table
-        return 0 if codes is None else sum(block.used for block in codes.blocks if block.scan is not None)
+        assert eventually(lambda: not table_of(lab.snapshot()).is_loose, 60)
+        return sum(block.used for block in table_of(lab.snapshot()).blocks if block.scan is not None)
 
     lab = make(store, 70, index="compact")
     assert 32 <= scanned(lab) <= 70
@@ -274,7 +274,7 @@ def test_damaged_and_missing_codes_are_made_again(
         found = lab.snapshot()
     assert "The codes of 3 rows of map lab are damaged and made again" in caplog.text
     assert store.quarantined() == {} and found.table is not None
-    codes, right = found.table.codes(0, PLACES), found.table.coder.encode(found.descriptors_at(np.arange(PLACES)))
+    codes, right = table_of(found).codes(0, PLACES), found.table.coder.encode(found.descriptors_at(np.arange(PLACES)))
     assert np.flatnonzero((codes != right).any(axis=1)).tolist() == [3], "another's, with its own checksum"
     lab.rebuild_index()
     report = lab.verify()
@@ -373,7 +373,7 @@ def test_rows_are_read_once_and_the_cache_stays_within_its_bytes(store: Store) -
     misses, hits = cache.misses, cache.hits
     found.locals_at(np.arange(50))
     assert misses >= 50 and (cache.misses, cache.hits) == (misses, hits + 50)
-    small = following.RowCache(1000)
+    small = RowCache(1000)
     for number in range(100):
         small.put({number: bytes(100)})
         assert small.size <= 1000

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.index.flat import vectors
 from core.store import Directory
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, local_of, stored_of
 from tests.syscalls import strace
 
-REPOSITORY = Path(__file__).parents[4]
+REPOSITORY = Path(__file__).parents[3]
 
 pytestmark = pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
 
@@ -32,7 +31,7 @@ def run(action: str, directory: Path, call: str, error: str, when: str) -> subpr
 @pytest.mark.parametrize(
     ("call", "error", "when"),
     [
-        # Descriptors and folders are synced with fsync, SQLite uses fdatasync.
+        # Files and folders are synced with fsync, SQLite uses fdatasync.
         ("fsync", "EIO", "2"),
         ("fdatasync", "EIO", "1"),
         *[pytest.param("fsync", "EIO", when, marks=pytest.mark.thorough) for when in ("4", "5", "7", "3+2")],
@@ -64,9 +63,9 @@ def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call
     lab = atlas.get("lab")
     assert [place.id for place in lab.places(None, 100)[0]] == ["p0", "p1", *taken]
     for row, name in enumerate(["p0", "p1", *taken]):
-        segment = lab.snapshot().segments[row // 4]
-        np.testing.assert_array_equal(vectors(segment.index)[row % 4], stored_of(name))
-        np.testing.assert_array_equal(segment.local[row % 4], local_of(name))
+        (found,) = lab.snapshot().descriptors_at(np.array([row]))
+        np.testing.assert_array_equal(found, stored_of(name))
+        np.testing.assert_array_equal(lab.snapshot().locals_at(np.array([row]))[0], local_of(name))
     assert lab.verify().ok
     atlas.close()
 
@@ -93,7 +92,7 @@ def test_a_commit_that_was_refused_does_not_come_back_with_a_crash(directory: Pa
 def test_a_change_that_was_refused_does_not_come_true_with_a_crash(
     directory: Path, call: str, before: list[str]
 ) -> None:
-    """A deletion that gives a segment back, a patch: nothing is appended, but SQLite's log has their frames."""
+    """A deletion, a patch: SQLite's log has their frames."""
     atlas = Directory(directory, rows_per_segment=4)
     lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     lab.enrol([frame(f"p{i}", sequence="monday" if i < 4 else "tuesday") for i in range(6)])

@@ -12,12 +12,13 @@ import psycopg
 import pytest
 
 from core.errors import StoreUnavailable, UnknownPlace
-from core.maps.records import COMPACT_FROM, Enrolment, MapSettings, TierSetting
+from core.maps.records import COMPACT_FROM, Enrolment, MapRecord, MapSettings, TierSetting
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
 from core.store import Map, following
 from core.store.cluster import Cluster
 from core.store.rows import RowCache
+from tests.core.store.conftest import table_of
 from tests.servers.postgres import Postgres
 from tests.service.wire import eventually
 
@@ -73,7 +74,7 @@ def expect_alike(one: Map, address: str) -> None:
         np.testing.assert_array_equal(held.locals_at(rows), read.locals_at(rows))
         assert (held.holds, held.table is None) == (read.holds, read.table is None)
         if held.table is not None and read.table is not None:
-            codes = held.table.codes(0, held.rows), read.table.codes(0, read.rows)
+            codes = table_of(held).codes(0, held.rows), table_of(read).codes(0, read.rows)
             np.testing.assert_array_equal(codes[0][rows], codes[1][rows])
     finally:
         fresh.close()
@@ -248,9 +249,8 @@ def test_codes_are_read_and_not_computed_and_made_again_where_they_are_damaged(
     monkeypatch.setattr(following.FollowedMap, "_encode", encoded)
     snapshot = there.snapshot()
     assert computed == [[7, 8]]
-    assert snapshot.table is not None
-    right = snapshot.table.coder.encode(snapshot.descriptors_at(np.arange(300)))
-    np.testing.assert_array_equal(snapshot.table.codes(0, 300), right)
+    right = table_of(snapshot).coder.encode(snapshot.descriptors_at(np.arange(300)))
+    np.testing.assert_array_equal(table_of(snapshot).codes(0, 300), right)
     report = stores[0].verify("lab")
     assert report.ok and "p7" in report.stale_caches[0] and "rebuild the index" in report.stale_caches[0]
     there.rebuild_index()
@@ -286,13 +286,13 @@ def test_blocks_of_codes_are_joined_in_the_background(stores: list[Cluster], mon
     done = threading.Event()
     join = following.FollowedMap._join
 
-    def joined(self: following.FollowedMap) -> None:
-        join(self)
+    def joined(self: following.FollowedMap, record: MapRecord) -> None:
+        join(self, record)
         done.set()
 
     monkeypatch.setattr(following.FollowedMap, "_join", joined)
     there.snapshot()
-    assert not there.snapshot().table.is_loose or done.wait(60)  # type: ignore[union-attr]
+    assert not table_of(there.snapshot()).is_loose or done.wait(60)
     query = frame("q", 5).descriptor[np.newaxis]
     ((rows, _),) = there.scope().search(query)
     assert rows[0] == 4

@@ -14,24 +14,25 @@ from pathlib import Path
 
 import pytest
 
+from core.disk.reserve import Reserve
 from core.errors import StorageFailure, StorageFull
-from core.maps import Enrolment, MapSettings
+from core.ledger.maps import rows
+from core.ledger.maps.connection import MapConnection
+from core.maps import Enrolment, MapSettings, PlaceFilter
 from core.store import Directory, Map
-from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.core.store.worker import LARGE
 
-REPOSITORY = Path(__file__).parents[4]
-LOCAL_BYTES = LOCAL_SHAPE[0] * LOCAL_SHAPE[1]
+REPOSITORY = Path(__file__).parents[3]
 
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 2 MB."""
+    """A file system of 16 MB."""
     folder = tmp_path / "small"
     folder.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(folder)], capture_output=True, check=False
+        ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(folder)], capture_output=True, check=False
     )
     if mounted.returncode != 0:
         pytest.skip("a small file system cannot be mounted here (it takes root)")
@@ -67,7 +68,7 @@ def until_refused(lab: Map, dimension: int, image_bytes: int, batch: int) -> lis
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("left", [400_000, 700_000])
+@pytest.mark.parametrize("left", [700_000, 1_400_000])
 @pytest.mark.parametrize(
     ("dimension", "image_bytes", "batch"),
     [(4096, 10, 1), (4096, 10, 7), (16, 50_000, 1), (16, 9_000, 5), (1024, 4_000, 3)],
@@ -91,13 +92,10 @@ def test_nothing_is_half_written_and_the_map_goes_on(
     assert lab.snapshot() is before
     ids = ["first", *taken]
     assert [place.id for place in lab.places(None, 1000)[0]] == ids
-    rows, _ = before.search(descriptor_of(ids[-1], dimension))
-    (found,) = lab.places_at(rows[:1].tolist())
+    best, _ = before.search(descriptor_of(ids[-1], dimension))
+    (found,) = lab.places_at(best[:1].tolist())
     assert found is not None
     assert found.id == ids[-1]
-    stored = sum(path.stat().st_size for path in (directory / "maps" / "lab").glob("*.seg"))
-    segments = -(-len(ids) // 8)
-    assert stored == segments * HEADER_BYTES + len(ids) * (dimension * 2 + LOCAL_BYTES + 24)
     assert lab.verify().ok
 
     ballast.unlink()
@@ -112,23 +110,55 @@ def test_nothing_is_half_written_and_the_map_goes_on(
     atlas.close()
 
 
-def test_deleting_a_sequence_makes_room(small_disk: Path) -> None:
+def test_deleting_a_sequence_makes_room(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
     atlas = Directory(small_disk / "data", rows_per_segment=8)
     lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
     for name in ("monday", "tuesday"):
         lab.enrol([frame(f"{name}{i}", dimension=LARGE, sequence=name) for i in range(48)])
-    fill_up(small_disk, 250_000)  # a deletion needs a little, too
-    more = [frame(f"new{i}", dimension=LARGE) for i in range(32)]
-    searching = lab.snapshot()
+    more = [frame(f"new{i}", dimension=LARGE) for i in range(40)]
+    reserve = Reserve(small_disk, 800_000)  # a deletion needs a little, too
+    assert reserve.hold()
+    fill_up(small_disk, 300_000)
     with pytest.raises(StorageFull):
-        lab.enrol(more)
-    assert lab.forget_sequence("monday") == 48
-    assert len(searching) == 96, "who began to search reads to the end"
-    with pytest.raises(StorageFull):
-        lab.enrol(more)
-    del searching
-    lab.enrol(more)
-    assert lab.verify().ok and lab.count_places() == 80
+        for start in range(0, 40, 8):
+            lab.enrol(more[start : start + 8])
+    there = lab.count_places()
+    assert reserve.making_room(lambda: lab.forget_sequence("monday")) == 48
+    for start in range(0, 40, 8):
+        lab.enrol(more[start : start + 8])
+    assert lab.verify().ok and there >= 96 and lab.count_places() == 88
+    atlas.close()
+
+
+def test_a_write_stays_acknowledged_when_what_is_deleted_behind_it_finds_no_room(
+    small_disk: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A write deletes rows that died a while ago in a transaction of its own, which may fail."""
+    atlas = Directory(small_disk / "data", rows_per_segment=8)
+    lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
+    lab.enrol([large_frame(f"p{i}", LARGE, 30_000) for i in range(12)])
+    assert lab.forget_all(PlaceFilter(ids=tuple(f"p{i}" for i in range(8))), 100)
+    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    clear = rows.clear
+
+    def without_room(connection: MapConnection) -> int:
+        fill_up(small_disk, 0)
+        return clear(connection)
+
+    monkeypatch.setattr(rows, "clear", without_room)
+    lab.edit({"description": "acknowledged"})
+    assert "The disk is full" in caplog.text
+    for _ in range(2):
+        assert lab.record.description == "acknowledged" and lab.verify().ok and lab.count_places() == 4
+        atlas.close()
+        (small_disk / "ballast").unlink(missing_ok=True)
+        atlas = Directory(small_disk / "data")
+        lab = atlas.get("lab")
+    monkeypatch.undo()
+    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    lab.edit({"description": "again"})
+    assert lab._uncleared() == 0 and lab.verify().ok
     atlas.close()
 
 
@@ -166,12 +196,11 @@ def test_a_start_on_a_full_disk_is_made_up_for_when_there_is_room(small_disk: Pa
 
 
 @pytest.mark.thorough
-def test_a_file_that_may_not_grow_is_a_full_disk(directory: Path) -> None:
+def test_a_file_that_may_not_grow_has_what_was_acknowledged(directory: Path) -> None:
     """By the limit that a process can set on itself, so that it runs everywhere."""
     command = [sys.executable, "-m", "tests.core.store.worker", "fill", str(directory)]
     finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, check=True, timeout=300)
     answer = json.loads(finished.stdout)
-    assert answer["error"] == "StorageFull"
+    assert answer["error"] in ("StorageFull", "StorageFailure")  # SQLite does not say why the system refused
     assert answer["places"] > 20
-    assert answer["size"] == HEADER_BYTES + answer["places"] * (LARGE * 2 + LOCAL_BYTES + 24)
     assert (answer["after"], answer["ok"]) == (answer["places"] + 1, True)

@@ -45,7 +45,7 @@ from tests.core.store.frames import (
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
 
 
-def changes(lab: Map, *items: object) -> list[str]:
+def changes(lab: Map, *items: Enrolment) -> list[str]:
     return [change for _, change in lab.enrol(items)]
 
 
@@ -187,7 +187,7 @@ def test_a_batch_over_several_segments_is_searched(lab: Map) -> None:
         (frame("q", metadata={"a": {1, 2}}), InvalidField),
     ],
 )
-def test_one_wrong_item_refuses_them_all(lab: Map, wrong: object, error: type[Exception]) -> None:
+def test_one_wrong_item_refuses_them_all(lab: Map, wrong: Enrolment, error: type[Exception]) -> None:
     lab.enrol([frame("before")])
     with pytest.raises(error):
         lab.enrol([frame("p"), wrong])

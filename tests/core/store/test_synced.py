@@ -10,7 +10,7 @@ import pytest
 
 from tests.syscalls import audit, is_marker, strace, strace_arguments
 
-REPOSITORY = Path(__file__).parents[4]
+REPOSITORY = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -33,19 +33,3 @@ def test_every_write_is_synced_before_it_is_acknowledged(trace: tuple[str, Path]
     assert report.acknowledgements > 300
     assert report.syncs > 300
     assert report.writes > 300
-
-
-def test_descriptors_are_synced_before_the_commit_that_names_them(trace: tuple[str, Path]) -> None:
-    def is_commit(call: str) -> bool:
-        """SQLite syncs its log: from then on what the log names may be found after a crash."""
-        return call.startswith("fdatasync(") and "map.sqlite-wal>" in call
-
-    def is_no_descriptor(path: str) -> bool:
-        return Path(path).suffix not in ("", ".seg")
-
-    text, directory = trace
-    report = audit(text, directory / "maps" / "lab", is_commit, is_ignored=is_no_descriptor)
-
-    assert report.violations == []
-    assert report.acknowledgements > 300
-    assert report.writes >= 6

@@ -6,16 +6,17 @@ from hashlib import sha256
 from pathlib import Path
 
 import pytest
-from core.storage.database.schema import driver_of
-from core.storage.files.segment_files import HEADER_BYTES
 
 from core.errors import MapQuarantined
+from core.index import Coder
 from core.index.flat import vectors
-from core.ledger.maps import frames
+from core.ledger.maps import rows
 from core.maps import MapSettings
-from core.store import Directory, Map
-from tests.core.storage.test_opening import flip
-from tests.core.store.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
+from core.maps.forms import Form
+from core.store import Directory, Map, verification
+from tests.core.store.edits import edit
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from tests.faults.damage import flip
 
 
 @pytest.fixture
@@ -33,181 +34,109 @@ def hall(atlas: Directory) -> Map:
     return hall
 
 
-@pytest.fixture
-def folder(directory: Path) -> Path:
-    return directory / "maps" / "hall"
-
-
-def execute(hall: Map, statement: str) -> None:
-    """Behind the back of everything that keeps the map in order."""
-    with hall._writing() as write:
-        driver_of(write.connection).execute(statement)
-
-
-def test_a_good_map(hall: Map, folder: Path) -> None:
+def test_a_good_map(hall: Map) -> None:
     report = hall.verify()
     assert (report.ok, report.places, report.rows) == (True, 9, 10)
     assert (report.problems, report.stale_caches) == ([], [])
-    with hall._reading() as connection:
-        _, of_keypoints, of_pictures = frames.room(connection)
-    assert of_keypoints > 9 * 68
-    assert report.checked_bytes == 10 * RECORD_BYTES + 9 * len("image 0") + of_keypoints
-    assert of_pictures == 9 * len("image 0")
+    form, code = Form.of(hall.record).frame.itemsize, Coder.of(DIMENSION).bytes_per_place
+    assert report.checked_bytes == 9 * (form + code + len("image 0"))
 
 
-def test_every_damaged_row_is_named(hall: Map, folder: Path) -> None:
-    for row, name in ((1, "descriptors-000001.seg"), (6, "descriptors-000002.seg"), (9, "descriptors-000003.seg")):
-        flip(folder / name, HEADER_BYTES + (row % 4) * RECORD_BYTES)
-    problems = "\n".join(hall.verify().problems)
-    assert "descriptors-000001.seg: row 1 (place 'p1') does not match its checksum" in problems
-    assert "descriptors-000002.seg: row 6 (of no place) does not match its checksum" in problems
-    assert "descriptors-000003.seg: row 9 (place 'p9') does not match its checksum" in problems
+@pytest.mark.parametrize("table", ["descriptors", "locals"])
+def test_every_damaged_row_is_named(hall: Map, table: str) -> None:
+    edit(hall, *(f"UPDATE {table} SET bytes = zeroblob(length(bytes)) WHERE row = {row}" for row in (1, 9)))
+    problems = hall.verify().problems
+    for name in ("p1", "p9"):
+        assert f"map.sqlite: place {name!r} has descriptors that do not match their checksum" in problems
 
 
-def test_a_flipped_bit_of_any_part_of_a_row_is_found(hall: Map, folder: Path) -> None:
-    path, start = folder / "descriptors-000003.seg", HEADER_BYTES + RECORD_BYTES
-    row, local = DESCRIPTOR_BYTES, DESCRIPTOR_BYTES + 24
-    for offset in (0, row - 1, row, row + 8, row + 12, row + 16, local, local + 7, local + 14):
-        flip(path, start + offset)
-        assert "descriptors-000003.seg: row 9 (place 'p9') does not match its checksum" in hall.verify().problems
-        flip(path, start + offset)
-    assert hall.verify().ok
-
-
-def test_many_damaged_rows_are_counted(atlas: Directory, directory: Path) -> None:
-    atlas._rows_per_segment = 64
+def test_many_damaged_rows_are_counted(atlas: Directory) -> None:
     lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     lab.enrol([frame(f"p{i}") for i in range(30)])
-    for row in range(30):
-        flip(directory / "maps" / "lab" / "descriptors-000001.seg", HEADER_BYTES + row * RECORD_BYTES)
+    edit(lab, "UPDATE descriptors SET bytes = zeroblob(length(bytes))")
     problems = lab.verify().problems
-    assert len([problem for problem in problems if "does not match" in problem]) == 10
-    assert "descriptors-000001.seg: the same is true of 20 more rows" in problems
-
-
-def test_a_missing_segment_does_not_hide_the_others(hall: Map, folder: Path) -> None:
-    (folder / "descriptors-000001.seg").unlink()
-    flip(folder / "descriptors-000002.seg", HEADER_BYTES)
-    problems = hall.verify().problems
-    assert "descriptors-000001.seg: the file is missing" in problems
-    assert "descriptors-000002.seg: row 4 (place 'p4') does not match its checksum" in problems
-
-
-def test_a_damaged_picture_is_named(hall: Map) -> None:
-    execute(hall, "UPDATE pictures SET bytes = x'00' WHERE row = 2")
-    assert hall.verify().problems == ["map.sqlite: the image of place 'p2' does not match its digest"]
+    assert len([problem for problem in problems if "do not match" in problem]) == 10
+    assert "map.sqlite: the same is true of 20 more places" in problems
 
 
 def test_an_image_that_is_not_the_one_enrolled_is_named(hall: Map) -> None:
     digest = sha256(b"x").hexdigest()
-    execute(hall, f"UPDATE pictures SET bytes = x'78', digest = x'{digest}' WHERE row = 2")
-    assert hall.verify().problems == ["map.sqlite: the image of place 'p2' does not match its digest"]
-
-
-def test_a_picture_that_is_missing_is_named(hall: Map) -> None:
-    execute(hall, "DELETE FROM pictures WHERE row = 2")
-    assert hall.verify().problems == ["map.sqlite: place 'p2' is recorded to keep image, which is not true"]
+    edit(hall, f"UPDATE pictures SET bytes = x'78', digest = x'{digest}' WHERE row = 2")
+    assert hall.verify().problems == ["map.sqlite: place 'p2' has an image that does not match its digest"]
 
 
 def test_what_is_searched_must_be_what_is_stored(hall: Map) -> None:
-    vectors(hall.snapshot().segments[1].index)[0, 0] += 1
-    assert hall.verify().problems == ["descriptors-000002.seg: row 4 (place 'p4') is not what is searched"]
+    held = hall.snapshot().segments[1].held
+    assert held is not None
+    vectors(held.index)[0, 0] += 1
+    assert hall.verify().problems == ["map.sqlite: place 'p4' is not what is searched"]
 
 
 def test_what_is_compared_after_the_search_must_be_what_is_stored(hall: Map) -> None:
-    hall.snapshot().segments[2].local[1, 2, 4] ^= 1
-    assert hall.verify().problems == ["descriptors-000003.seg: row 9 (place 'p9') is not what is searched"]
+    held = hall.snapshot().segments[2].held
+    assert held is not None
+    held.local[1, 2, 4] ^= 1
+    assert hall.verify().problems == ["map.sqlite: place 'p9' is not what is searched"]
 
 
 @pytest.mark.parametrize(
     ("statement", "problem"),
     [
-        ("UPDATE places SET x = 1, y = 2 WHERE id = 'p1'", "row 1 differs between what is searched and map.sqlite"),
-        ("UPDATE places SET ordinal = 77 WHERE id = 'p1'", "row 1 differs between what is searched and map.sqlite"),
-        ("DELETE FROM places WHERE id = 'p1'", "9 places in 10 rows are searched, 8 in 10 are stored"),
-        ("UPDATE places SET row = 6 WHERE id = 'p1'", "row 6 differs between what is searched and map.sqlite"),
-        ("UPDATE places SET row = 99 WHERE id = 'p1'", "map.sqlite: place 'p1' has row 99, but there are 10"),
-        ("UPDATE places SET checksum = 5 WHERE id = 'p1'", "row 1 (place 'p1') is not the one that map.sqlite records"),
-        (
-            "UPDATE segments SET checksum = 5 WHERE number = 2",
-            "its rows are not those in map.sqlite",
-        ),
-    ],
-)
-def test_disagreement_of_store_and_snapshot(hall: Map, statement: str, problem: str) -> None:
-    execute(hall, statement)
-    report = hall.verify()
-    assert not report.ok
-    assert any(problem in found for found in report.problems), report.problems
-
-
-@pytest.mark.parametrize(
-    ("statement", "problem"),
-    [
+        ("UPDATE pictures SET bytes = x'00' WHERE row = 2", "place 'p2' has a stored image that does not match"),
+        ("DELETE FROM pictures WHERE row = 2", "place 'p2' is recorded to keep image, which is not true"),
+        ("UPDATE places SET x = 1, y = 2 WHERE id = 'p1'", "row 1 is searched elsewhere than it is"),
+        ("UPDATE places SET ordinal = 77 WHERE id = 'p1'", "row 1 is searched elsewhere than it is"),
+        ("DELETE FROM places WHERE id = 'p1'", "9 places and looks are searched, 8 are stored"),
+        ("UPDATE places SET row = 6 WHERE id = 'p1'", "row 6 is searched elsewhere than it is"),
+        ("UPDATE places SET row = 99 WHERE id = 'p1'", "a place has row 99, but there are 10"),
+        ("UPDATE descriptors SET row = 77 WHERE row = 1", "place 'p1' has no descriptors"),
         ("DELETE FROM sequences WHERE name = 's'", "place 'p0' is of a sequence that is missing"),
-        ("UPDATE sequences SET next_ordinal = 9 WHERE name = 's'", "sequence 's' is empty, or ends before its last"),
-        ("INSERT INTO sequences VALUES (1, 77, 't', 3)", "sequence 't' is empty, or ends before its last place"),
-        ("UPDATE maps SET places = 8", "its record counts 8 places and 0 looks in 10 rows, but there are 9 and 0"),
-        ("UPDATE maps SET rows = 11", "its record counts 9 places and 0 looks in 11 rows, but there are 9 and 0"),
+        ("UPDATE sequences SET next_ordinal = 9, negative = -9 WHERE name = 's'", "'s' is empty, or ends before its"),
+        ("INSERT INTO sequences VALUES (1, 77, 't', 3, -3)", "sequence 't' is empty, or ends before its last place"),
+        ("UPDATE maps SET places = 8", "its record counts 8 places and 0 looks, but there are 9 and 0"),
         ("UPDATE maps SET numbers = 10", "the next number of a place, 10, is not above those there are"),
         ("UPDATE maps SET codes = 0", "the next code of a sequence, 0, is not above those there are"),
         ("UPDATE maps SET revision = 0", "the revision, 0, is below those of places"),
         ("UPDATE maps SET record = replace(record, 'image', 'none')", "it does not match its checksum"),
-        ("UPDATE layout SET seal = seal + 1", "it does not say how many rows a segment has"),
         ("INSERT INTO cameras VALUES (1, 'front', NULL, NULL, '', 0)", "camera 'front' does not match its checksum"),
         ("DELETE FROM tokens", "row 9 is not indexed correctly by its metadata"),
         ("INSERT INTO tokens VALUES (1, 'feed', 3)", "row 3 is not indexed correctly by its metadata"),
-        ("DELETE FROM keypoints WHERE row = 3; UPDATE keypoints SET row = 3 WHERE row = 4", "keypoints of place 'p3'"),
-        ("UPDATE pictures SET row = 6 WHERE row = 5", "the pictures or keypoints of 1 rows belong to no place"),
+        ("DELETE FROM keypoints WHERE row = 3; UPDATE keypoints SET row = 3 WHERE row = 4", "'p3' has keypoints that"),
+        ("UPDATE pictures SET row = 66 WHERE row = 5", "the descriptors, pictures or keypoints of 1 rows belong to no"),
+        ("INSERT INTO dead_rows VALUES (1, 3, 1, 0, 0)", "row 3 has a place and is noted as dead"),
     ],
 )
 def test_rows_that_contradict_one_another(hall: Map, statement: str, problem: str) -> None:
     hall.patch("p9", {"metadata": {"floor": 1}})
-    assert hall.verify().ok
-    for one in statement.split("; "):
-        execute(hall, one)
-    assert any(problem in found for found in hall.verify().problems)
+    assert len(hall.snapshot()) == 9 and hall.verify().ok
+    edit(hall, *statement.split("; "))
+    assert any(problem in found for found in hall.verify().problems), hall.verify().problems
 
 
-def test_places_enrolled_meanwhile_are_not_in_the_report(hall: Map, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The report is of the moment of the call, although writes go on."""
-    from core.store import verification
-
-    check_tables = verification._check_tables
-
-    def enrol_first(*arguments: object) -> None:
-        hall.enrol([frame(f"late{i}") for i in range(5)])
-        hall.forget("p1")
-        check_tables(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(verification, "_check_tables", enrol_first)
-    report = hall.verify()
-    assert (report.problems, report.places, report.rows) == ([], 9, 10)
-    assert hall.count_places() == 13
+def test_a_damaged_note_of_a_dead_row_deletes_nothing_of_a_place(hall: Map) -> None:
+    edit(hall, "INSERT INTO dead_rows VALUES (1, 3, 1, 0, 0)")
+    hall.edit({"description": "another"})
+    assert hall.picture("p3") == b"image 3" and hall.verify().problems == [
+        "map.sqlite: row 3 has a place and is noted as dead"
+    ]
 
 
-def test_the_log_can_be_emptied_while_descriptors_are_read(hall: Map, folder: Path) -> None:
-    """What is deleted meanwhile is no damage, and what is reclaimed waits until it is read."""
-    log = folder / "map.sqlite-wal"
-    told: list[int] = []
+def test_places_that_change_meanwhile_are_no_damage(hall: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writes go on, and so does what deletes behind them."""
+    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    monkeypatch.setattr(verification, "AT_ONCE", 2)
+    seen: list[int] = []
 
-    def write(done: int, total: int) -> None:
-        opened = hall._opened
-        assert opened is not None
-        if not told:
-            hall.forget("p9")
-            hall.enrol([frame("late")])
-            for i in range(4):
-                hall.forget(f"p{i}")
-            opened.database.empty_log()
-            assert log.stat().st_size == 0
-        told.append(done)
+    def write(done: int, _total: int) -> None:
+        if not seen:
+            hall.enrol([frame(f"late{i}") for i in range(5)] + [frame("p9", "another")])
+            hall.forget("p7")
+            hall.forget("p1")
+        seen.append(done)
 
     report = hall.verify(write)
     assert (report.problems, report.places, report.rows) == ([], 9, 10)
-    assert told and hall.count_places() == 5
-    hall.edit({"description": "another"})
-    assert not (folder / "descriptors-000001.seg").exists() and hall.verify().ok
+    assert len(seen) > 2 and hall.count_places() == 12 and hall.verify().ok
 
 
 def test_a_damaged_log_is_kept_as_it_is(directory: Path, tmp_path: Path) -> None:
@@ -227,7 +156,7 @@ def test_a_damaged_log_is_kept_as_it_is(directory: Path, tmp_path: Path) -> None
         with pytest.raises(MapQuarantined):
             again.get("lab")
         report = again.verify("lab")
-        assert not report.ok and any(line.startswith("map.sqlite-wal: frame 1 ") for line in report.problems)
+        assert not report.ok and any("map.sqlite-wal: frame 1 " in line for line in report.problems)
         again.close()
         assert {name: path.read_bytes() for name, path in kept.items()} == before
     flip(kept["map.sqlite-wal"], 32 + 24 + 5)  # as if put back from a backup

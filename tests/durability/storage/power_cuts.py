@@ -20,6 +20,13 @@ ATTACHING_SECONDS = 30.0
 
 def attach(process: StorageProcess, tracer: list[str], log: Path) -> subprocess.Popen[bytes]:
     """Attach a tracer to a waiting process, then let the process go on."""
+    tracing = trace(process, tracer, log)
+    process.connections[0].begin()
+    return tracing
+
+
+def trace(process: StorageProcess, tracer: list[str], log: Path) -> subprocess.Popen[bytes]:
+    """Attach a tracer to a process, and wait until it is there."""
     with log.open("ab") as told:
         before = told.tell()
         tracing = subprocess.Popen([*tracer, "-p", str(process.number)], stderr=told)
@@ -27,7 +34,6 @@ def attach(process: StorageProcess, tracer: list[str], log: Path) -> subprocess.
     while b" attached" not in log.read_bytes()[before:]:  # it has stopped then, and goes on when the tracer lets it
         assert tracing.poll() is None and time.monotonic() < until, log.read_text()[-2000:]
         time.sleep(0.002)
-    process.connections[0].begin()
     return tracing
 
 
@@ -51,10 +57,10 @@ def record(processes: StorageProcesses, folder: Path, seed: object, operations: 
     Raises:
         Lost: an answer was wrong.
     """
-    worker, trace = Worker(seed, 0), folder / "trace"
+    worker, traced = Worker(seed, 0), folder / "trace"
     worlds = [worker.candidates[0]]
     process = processes.begin(folder / "data", waiting=True)
-    tracer = attach(process, arguments(trace), folder / "strace.log")
+    tracer = attach(process, arguments(traced), folder / "strace.log")
     try:
         for _ in range(operations):
             worker.acknowledge(process.connections[0].ask(worker.next()))
@@ -65,7 +71,7 @@ def record(processes: StorageProcesses, folder: Path, seed: object, operations: 
         process.kill()
         process.close()
         tracer.wait(60)
-    return trace, worlds
+    return traced, worlds
 
 
 def told(sent: bytes) -> str | None:
@@ -73,10 +79,10 @@ def told(sent: bytes) -> str | None:
     return "ack" if sent.startswith(b"ack ") else None
 
 
-def moments(disk: Disk, trace: Path) -> Iterator[int]:
+def moments(disk: Disk, traced: Path) -> Iterator[int]:
     """After each change of the disk: how many operations were acknowledged."""
     acknowledged = 0
-    with trace.open() as lines:
+    with traced.open() as lines:
         for what in disk.replay(lines, told):
             acknowledged += what is not None
             yield acknowledged
@@ -88,12 +94,12 @@ def power(processes: StorageProcesses, folder: Path, seed: object, operations: i
     Raises:
         Lost: something that was acknowledged is not there, or something is half there.
     """
-    trace, worlds = record(processes, folder, seed, operations)
+    traced, worlds = record(processes, folder, seed, operations)
 
     def look(image: Path, acknowledged: int) -> None:
         check(processes, image, worlds[acknowledged : acknowledged + 2])
 
-    return cut(folder, seed, PowerTally(operations), disks, lambda disk: moments(disk, trace), look)
+    return cut(folder, seed, PowerTally(operations), disks, lambda disk: moments(disk, traced), look)
 
 
 def cut(

@@ -92,7 +92,7 @@ def test_a_key_depends_on_what_the_libraries_are(monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_code_digest_covers_what_computes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for name in ("core/vlad.py", "lab/systems/hog.py", "lab/evaluation/report/page.py", "core/storage/disk.py"):
+    for name in ("core/vlad.py", "lab/systems/hog.py", "lab/evaluation/report/page.py", "core/store/map.py"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("1")
     monkeypatch.setattr(module, "__file__", str(tmp_path / "lab/evaluation/cache.py"))
@@ -104,7 +104,7 @@ def test_the_code_digest_covers_what_computes(monkeypatch: pytest.MonkeyPatch, t
     first = digest()
     for name, counts in [
         ("lab/evaluation/report/page.py", False),
-        ("core/storage/disk.py", False),
+        ("core/store/map.py", False),
         ("lab/systems/hog.py", True),
         ("core/vlad.py", True),
     ]:

@@ -79,7 +79,7 @@ def of_sequence(values: dict[str, Any]) -> Statement:
 
 
 DAMAGES: dict[str, tuple[Statement, list[str | None], list[str]]] = {
-    "an end before the last place": (of_sequence({"next_ordinal": 1}), ["walk"], []),
+    "an end before the last place": (of_sequence({"next_ordinal": 1, "negative": -1}), ["walk"], []),
     "a sequence without places": (
         Statement(insert(SEQUENCES).values(map=bindparam("map"), code=77, name="empty", next_ordinal=0)), ["empty"], [],
     ),
@@ -92,7 +92,7 @@ DAMAGES: dict[str, tuple[Statement, list[str | None], list[str]]] = {
         Statement(
             update(SEQUENCES)
             .where(SEQUENCES.c.map == bindparam("map"), SEQUENCES.c.code == NO_SEQUENCE)
-            .values(next_ordinal=0)
+            .values(next_ordinal=0, negative=0)
         ),
         [None], [],
     ),

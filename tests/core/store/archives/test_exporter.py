@@ -166,7 +166,7 @@ def test_a_map_that_is_deleted_does_not_wait_for_its_export(
 
 def test_the_state_changes_with_every_write(full: Map) -> None:
     seen = [full.exporter.state()]
-    for write in (
+    writes: list[Callable[[], object]] = [
         lambda: full.enrol([frame("z")]),
         lambda: full.forget("z"),
         lambda: full.cameras.put("rear", None),
@@ -174,7 +174,8 @@ def test_the_state_changes_with_every_write(full: Map) -> None:
         lambda: full.review.keep(b"shown", {"verdict": "unknown"}, ReviewSetting()) and label(full, stranger=True),
         lambda: label(full, place="a"),
         lambda: full.review.label(1, None),
-    ):
+    ]
+    for write in writes:
         write()
         seen.append(full.exporter.state())
     assert all(one != other for one, other in pairwise(seen))
@@ -226,9 +227,7 @@ def test_damage_is_found_and_not_exported(full: Map, tmp_path: Path, statement: 
     assert list(tmp_path.glob("*.tar")) == []
 
 
-def test_a_map_that_is_not_open_can_be_exported(
-    directory: Path, full: Map, atlas: Directory, tmp_path: Path
-) -> None:
+def test_a_map_that_is_not_open_can_be_exported(directory: Path, full: Map, atlas: Directory, tmp_path: Path) -> None:
     state = full.exporter.state()
     atlas.close()
     again = Directory(directory)
