@@ -386,9 +386,11 @@ class VerifyReport(BaseModel):
     ok: bool = Field(description="Nothing of the map is damaged; a cache may still have to be rebuilt.")
     places: int = Field(ge=0)
     rows: int = Field(ge=0, description="Descriptors stored, those of forgotten places included.")
-    checked_bytes: int = Field(ge=0, description="Bytes of descriptors, pictures and caches that were read again.")
-    problems: list[str] = Field(description="Each names a file and what is damaged in it.")
-    stale_caches: list[str] = Field(description="Index files that are missing or damaged; rebuilt at the next start.")
+    checked_bytes: int = Field(ge=0, description="Bytes of descriptors, pictures and codes that were read again.")
+    problems: list[str] = Field(description="Each says what is damaged.")
+    stale_caches: list[str] = Field(
+        description="Codes that are damaged: they are computed again when the map is read, until its index is rebuilt."
+    )
 
 
 MOST_FAULTS = 10
