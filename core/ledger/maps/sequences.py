@@ -34,9 +34,7 @@ _NEXT = Statement(
 )
 _FREE = greatest(_S.next_ordinal, bindparam("least"))
 _KEEP_FREE = Statement(
-    update(SEQUENCES)
-    .where(_OF_MAP, _S.code == bindparam("which"))
-    .values(next_ordinal=_FREE, negative=-_FREE)
+    update(SEQUENCES).where(_OF_MAP, _S.code == bindparam("which")).values(next_ordinal=_FREE, negative=-_FREE)
 )
 _DROP = Statement(
     delete(SEQUENCES).where(
