@@ -10,15 +10,15 @@ from pathlib import Path
 
 import psycopg
 import pytest
+from core.postgres import rows
+from core.postgres.map import PostgresMap
 
 from core.errors import MapExists, StoreOfAnotherVersion, StoreUnavailable, UnknownPlace
 from core.ledger.maps import frames
 from core.maps import MapSettings
 from core.maps.archives.reading import Archive
-from core.postgres import rows
-from core.postgres.map import PostgresMap
-from core.store.cluster import Cluster
 from core.store import Directory
+from core.store.cluster import Cluster
 from tests.core.maps.mixed import check_one_kind_wins
 from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing
 from tests.core.maps.writers import check_writers_lose_nothing

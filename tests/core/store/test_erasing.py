@@ -16,8 +16,8 @@ from core.index import Coder
 from core.ledger.maps import rows
 from core.ledger.maps.places import tokens_of
 from core.maps import MapSettings, PlaceFilter, ReviewSetting
-from core.maps.records import Enrolment
 from core.maps.forms import pack_descriptors, pack_local
+from core.maps.records import Enrolment
 from core.store import Directory, Map
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
 

@@ -11,14 +11,14 @@ from typing import Any, TypeVar
 import numpy as np
 import psycopg
 import pytest
+from core.postgres.search import following
+from core.postgres.search.cache import RowCache
+from core.postgres.search.map import CodedMap
 
 from core.errors import StoreUnavailable, UnknownPlace
 from core.maps.records import COMPACT_FROM, Enrolment, MapSettings
 from core.maps.selection import Conditions, Selection
 from core.places import PlaceFields, Pose
-from core.postgres.search import following
-from core.postgres.search.cache import RowCache
-from core.postgres.search.map import CodedMap
 from core.store.cluster import Cluster
 from tests.servers.postgres import Postgres
 
@@ -257,9 +257,7 @@ def test_rows_are_read_once_and_the_cache_stays_within_its_bytes(stores: list[Cl
     assert 0 < len(small) < 10 and not small.get([0]) and small.get([99])
 
 
-def test_blocks_of_codes_are_joined_in_the_background(
-    stores: list[Cluster], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_of_codes_are_joined_in_the_background(stores: list[Cluster], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("core.index.table.LOOSE_ROWS", 256)
     here, there = maps_of(stores)
     here.enrol([frame(f"p{number}", number + 1) for number in range(300)])

@@ -6,6 +6,8 @@ import sqlite3
 from pathlib import Path
 
 import pytest
+from core.storage.review import FILE, ReviewFrames
+from core.storage.verification import inspect_folder
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,8 +15,6 @@ from core.errors import StorageFailure, UnknownFrame, UnknownMap
 from core.maps import MapSettings, ReviewSetting
 from core.maps.review import StoredReviews
 from core.store import Directory
-from core.storage.review import FILE, ReviewFrames
-from core.storage.verification import inspect_folder
 from tests.core.maps.review import check_pages_are_of_one_moment
 
 ENCODER = "some@" + "0" * 64

@@ -226,9 +226,7 @@ def test_damage_is_found_and_not_exported(full: Map, tmp_path: Path, statement: 
     assert list(tmp_path.glob("*.tar")) == []
 
 
-def test_a_map_that_is_not_open_can_be_exported(
-    directory: Path, full: Map, atlas: Directory, tmp_path: Path
-) -> None:
+def test_a_map_that_is_not_open_can_be_exported(directory: Path, full: Map, atlas: Directory, tmp_path: Path) -> None:
     state = full.exporter.state()
     atlas.close()
     again = Directory(directory)
