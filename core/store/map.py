@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from core.disk.files import Damage
@@ -107,6 +108,7 @@ class Map(LedgerMap):
         rows_per_segment: int = ROWS_PER_SEGMENT,
     ) -> None:
         self.database, self._state, self._cache = database, state, cache
+        self._posed = state.posed  # a place that may have a pose, by which others learn of what kind theirs must be
         self._noted = (-1.0, state)  # the last state that was read, and when it was asked for
         self._followed = FollowedMap(database, self._glancing, cache, milvus, rows_per_segment)
         self._room: tuple[object, StorageStatus] | None = None
@@ -428,9 +430,11 @@ class Map(LedgerMap):
     def _writing(self) -> Iterator[Write]:
         """One write, which is stored whole at the end of the block, or not at all."""
         with self._transaction() as connection:
-            write = Write(connection, record.state_of(connection, self.record.id, locked=True))
+            state = record.state_of(connection, self.record.id, locked=True)
+            write = Write(connection, replace(state, posed=self._posed))
             yield write
             write.finish()
+        self._posed = write.state.posed
         self.note(write.state)
         try:
             self._tidy()

@@ -70,12 +70,12 @@ class ScriptProcesses:
         self._process.stdin.close()
         self._process.wait(60)
 
-    def run(self, folder: Path, arguments: Sequence[str], indexed: bool = False) -> dict[str, Any]:
+    def run(self, folder: Path, arguments: Sequence[str]) -> dict[str, Any]:
         """Run the script with its data in ``folder / "data"``; its report (:func:`tests.faults.script.run`)."""
         folder.mkdir(parents=True, exist_ok=True)
         go, result = folder / "go", folder / "result"
         assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(json.dumps([str(folder / "data"), str(go), str(result), indexed]) + "\n")
+        self._process.stdin.write(json.dumps([str(folder / "data"), str(go), str(result)]) + "\n")
         self._process.stdin.flush()
         child = int(self._process.stdout.readline())
         with attached(child, arguments):
@@ -95,12 +95,12 @@ def _wait_for(path: Path, process: int) -> None:
         time.sleep(0.002)
 
 
-def write_points(scripts: ScriptProcesses, indexed: bool = False) -> list[Point]:
+def write_points(scripts: ScriptProcesses) -> list[Point]:
     """All write points of the script, from one run without a fault."""
     folder = Path(tempfile.mkdtemp(prefix="points-"))
     try:
         trace = folder / "trace"
-        scripts.run(folder, ["-y", "-o", str(trace), "-e", f"trace={','.join(WRITE_CALLS)}"], indexed)
+        scripts.run(folder, ["-y", "-o", str(trace), "-e", f"trace={','.join(WRITE_CALLS)}"])
         return points_of(trace.read_text(), str(folder / "data"))
     finally:
         shutil.rmtree(folder)

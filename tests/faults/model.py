@@ -58,6 +58,7 @@ def told(map_: Map) -> State:
         "index": map_.record.index,
         "cameras": {camera.name: camera.mask is not None for camera in map_.cameras.all()},
         "places": places,
+        "reviewed": [map_.review.picture(one.number).decode() for one in map_.review.page(None, 10).frames],
     }
     # A sound map has as many rows as places; of a damaged one this is another answer.
     return state if len(snapshot) == len(places) else {**state, "rows": len(snapshot)}

@@ -1,6 +1,6 @@
 """Forks a child for each run of the script off a process that has imported everything, so that a run starts at once.
 
-``python -m tests.faults.script_forks`` reads lines of JSON, ``[directory, go, result, indexed]`` the
+``python -m tests.faults.script_forks`` reads lines of JSON, ``[directory, go, result]`` the
 arguments of :func:`tests.faults.script.run`, and answers each with the child's process id.
 """
 
@@ -15,8 +15,8 @@ import tempfile
 from pathlib import Path
 
 import faiss
-from core.storage.search import snapshot
 
+from core.store import snapshot
 from tests.faults import script
 
 _SET_TRACER, _ANY = 0x59616D61, ctypes.c_ulong(-1)
@@ -39,16 +39,16 @@ def _warm_up() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name in ("go", "passed"):
             (Path(folder) / name).touch()
-        script.run(Path(folder) / "data", Path(folder) / "go", Path(folder) / "result", False)
+        script.run(Path(folder) / "data", Path(folder) / "go", Path(folder) / "result")
     snapshot.threads.cache_clear()
 
 
 def _be_child(line: str) -> None:
     ctypes.CDLL(None).prctl(_SET_TRACER, _ANY, 0, 0, 0)  # where only parents may trace otherwise
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    directory, go, result, indexed = json.loads(line)
+    directory, go, result = json.loads(line)
     try:
-        script.run(Path(directory), Path(go), Path(result), indexed)
+        script.run(Path(directory), Path(go), Path(result))
     finally:
         os._exit(0)
 

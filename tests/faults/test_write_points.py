@@ -15,7 +15,7 @@ import pytest
 from core.store import Directory
 from tests.faults.injection import Point, ScriptProcesses, write_points
 from tests.faults.model import State, all_told
-from tests.faults.script import AFTERWARDS, PLAIN, STEPS, Step, empty
+from tests.faults.script import AFTERWARDS, STEPS, Step, empty
 from tests.syscalls import strace
 
 pytestmark = pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
@@ -101,17 +101,15 @@ def check(told: dict[str, Any], directory: Path, steps: Sequence[Step]) -> None:
     assert not [path for path in (directory / "maps").iterdir() if path.name.startswith((".making", ".removing"))]
 
 
-def inject(
-    scripts: ScriptProcesses, folder: Path, point: Point, error: str, count: int = 1, indexed: bool = False
-) -> None:
+def inject(scripts: ScriptProcesses, folder: Path, point: Point, error: str, count: int = 1) -> None:
     """Let ``count`` calls fail from a point on, and check the result."""
     when = f"{point.number}..{point.number + count - 1}" if count > 1 else str(point.number)
     fault = f"inject={point.call}:error={error}:when={when}"
     arguments = ["-o", str(folder.with_suffix(".trace")), "-e", f"trace={point.call}", "-e", fault]
     try:
-        told = scripts.run(folder, arguments, indexed)
-        assert "INJECTED" in folder.with_suffix(".trace").read_text() or indexed
-        check(told, folder / "data", STEPS if indexed else PLAIN)
+        told = scripts.run(folder, arguments)
+        assert "INJECTED" in folder.with_suffix(".trace").read_text()
+        check(told, folder / "data", STEPS)
     except AssertionError as error_found:
         raise AssertionError(f"seed {SEED}, {fault}: {point.text[:120]}: {error_found}") from error_found
     finally:
@@ -186,16 +184,3 @@ def test_every_window_of_refusals(scripts: ScriptProcesses, points: list[Point],
         except AssertionError as failure:
             failures.append(str(failure))
     assert not failures, f"{len(failures)} of {len(points)}:\n" + "\n".join(failures)
-
-
-@pytest.mark.soak
-@pytest.mark.timeout(7200)
-def test_the_index_at_its_write_points(scripts: ScriptProcesses, tmp_path: Path) -> None:
-    failures = []
-    chosen = [point for point in write_points(scripts, indexed=True) if point.call not in ("pwrite64", "mmap")]
-    for number, point in enumerate(chosen):
-        try:
-            inject(scripts, tmp_path / str(number), point, ("ENOSPC", "EIO")[number % 2], indexed=True)
-        except AssertionError as failure:
-            failures.append(str(failure))
-    assert not failures, f"{len(failures)} of {len(chosen)}:\n" + "\n".join(failures)

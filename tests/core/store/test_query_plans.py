@@ -24,7 +24,7 @@ from tests.core.store.frames import frame
 NOON = datetime(2026, 11, 20, 12, tzinfo=UTC)
 LAST = RecentFrames("s", 3)
 
-LARGE = "places|tokens|pictures|keypoints|descriptors|locals|codes|dead_rows|review_frames|review_pictures"
+LARGE = "places|tokens|pictures|keypoints|descriptors|locals|codes|dead_rows|review_pictures"
 
 ACTIONS: dict[str, Callable[[Map], object]] = {
     "enrol": lambda lab: lab.enrol([frame("new", sequence="s", metadata={"floor": 1}, camera="front")]),

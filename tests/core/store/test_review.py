@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
-import sqlite3
 from pathlib import Path
 
 import pytest
-from core.storage.review import FILE, ReviewFrames
-from core.storage.verification import inspect_folder
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from core.errors import StorageFailure, UnknownFrame, UnknownMap
+from core.ledger.maps.review import Review
 from core.maps import MapSettings, ReviewSetting
 from core.maps.review import StoredReviews
 from core.store import Directory
 from tests.core.maps.review import check_pages_are_of_one_moment
+from tests.core.store.edits import edit
 
 ENCODER = "some@" + "0" * 64
 SETTING = ReviewSetting(most_frames=5, most_bytes=1 << 16)
 ANSWER = {"verdict": "unknown", "score": 0.25, "camera": None, "text": "naïve\u2028 <b>"}
 
 
-def frames_at(folder: Path) -> ReviewFrames:
-    return ReviewFrames(folder / FILE, "lab", lambda: None)
+class Opened(Review):
+    """The frames of the map "lab" of a data directory, which is made if it is missing."""
+
+    def __init__(self, folder: Path) -> None:
+        self.store = Directory(folder / "data")
+        listed = self.store.records(None, 1)[0]
+        found = self.store.get("lab") if listed else self.store.create("lab", ENCODER, 8)
+        super().__init__(found.review._reading, found.review._writing)
+
+    def close(self) -> None:
+        self.store.close()
+
+
+def frames_at(folder: Path) -> Opened:
+    return Opened(folder)
 
 
 def test_a_frame_is_stored_with_its_answer_and_survives_a_restart(tmp_path: Path) -> None:
     review = frames_at(tmp_path)
-    assert review.page(None, 10) == StoredReviews([], 0, 0) and not (tmp_path / FILE).exists()
+    assert review.page(None, 10) == StoredReviews([], 0, 0)
     assert review.keep(b"one", ANSWER, SETTING) and review.keep(b"two", {"verdict": "ambiguous"}, SETTING)
     assert not review.keep(b"one", ANSWER, SETTING), "the same file is kept once"
     review.label(1, {"label": {"place": "p7"}})
@@ -101,7 +113,6 @@ def test_lower_limits_give_back_the_room(tmp_path: Path) -> None:
     review.shrink(ReviewSetting(most_frames=2, most_bytes=1 << 24))
     assert [one.number for one in review.page(None, 10).frames] == [20, 19]
     review.close()
-    assert (tmp_path / FILE).stat().st_size < 500_000
 
 
 def test_a_frame_that_is_held_is_not_dropped_for_newer_ones(tmp_path: Path) -> None:
@@ -116,100 +127,35 @@ def test_a_frame_that_is_held_is_not_dropped_for_newer_ones(tmp_path: Path) -> N
     review.close()
 
 
-def edit(path: Path, statement: str, *values: object) -> None:
-    connection = sqlite3.connect(path)
-    with connection:
-        connection.execute(statement, values)
-    connection.close()
-
-
 def test_what_does_not_match_its_checksum_is_not_shown(tmp_path: Path) -> None:
+    """Verifying names it; a frame that is damaged can be discarded."""
     review = frames_at(tmp_path)
-    for number in range(3):
-        review.keep(bytes([number]), ANSWER, SETTING)
-    review.close()
-    edit(tmp_path / FILE, "UPDATE review_frames SET answer = replace(answer, 'unknown', 'unknowm') WHERE number = 1")
-    edit(tmp_path / FILE, "UPDATE review_pictures SET bytes = x'FF' WHERE number = 2")
-    review = frames_at(tmp_path)
-    assert [one.number for one in review.page(None, 10).frames] == [3, 2]
-    with pytest.raises(StorageFailure, match="damaged"):
-        review.picture(2)
-    assert review.picture(3) == b"\x02"
-    review.close()
-
-
-def test_a_damaged_file_is_put_aside_and_the_map_goes_on(tmp_path: Path) -> None:
-    (tmp_path / FILE).write_bytes(b"no database at all" * 100)
-    review = frames_at(tmp_path)
-    assert review.page(None, 10).frames == [] and review.keep(b"one", ANSWER, SETTING)
-    assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
-    review.close()
-
-
-def test_frames_of_another_map_are_not_shown(tmp_path: Path) -> None:
-    """Two maps whose files change places, as a careless restore may do it."""
-    atlas = Directory(tmp_path / "data")
-    for name in ("lab", "hall"):
-        review = atlas.create(name, ENCODER, 8, MapSettings(review=SETTING)).review
-        assert review.keep(f"a frame of {name}".encode(), ANSWER, SETTING)
-        assert atlas.verify(name).ok
-    atlas.close()
-    lab, hall, aside = (tmp_path / "data" / "maps" / name for name in ("lab", "hall", "aside"))
-    for source, target in ((lab, aside), (hall, lab), (aside, hall)):
-        target.mkdir(exist_ok=True)
-        (source / FILE).rename(target / FILE)
-    aside.rmdir()
-    atlas = Directory(tmp_path / "data")
-    report = atlas.verify("lab")
-    assert not report.ok and report.problems == [f"{FILE}: it belongs to the map 'hall'"]
-    for name, folder in (("lab", lab), ("hall", hall)):
-        review = atlas.get(name).review
-        assert review.page(None, 10) == StoredReviews([], 0, 0)
-        assert review.keep(b"new", ANSWER, SETTING) and atlas.verify(name).ok
-        assert len(list(folder.glob(f"{FILE}.damaged-*"))) == 1
-    atlas.close()
-
-
-@pytest.mark.parametrize("statement", ["DROP TABLE review_map", "DELETE FROM review_map"])
-def test_a_file_that_names_no_map_yet_is_taken(tmp_path: Path, statement: str) -> None:
-    """Of an earlier version, or of a crash right after it was made."""
-    review = frames_at(tmp_path)
-    review.keep(b"one", ANSWER, SETTING)
-    review.close()
-    edit(tmp_path / FILE, statement)
-    if statement.startswith("DROP"):
-        edit(tmp_path / FILE, "PRAGMA user_version = 2")
-    assert frames_at(tmp_path).check() == ([], 3)
-    review = frames_at(tmp_path)
-    assert review.page(None, 10).count == 1
-    review.close()
-    other = ReviewFrames(tmp_path / FILE, "hall", lambda: None)
-    assert other.check() == ([f"{FILE}: it belongs to the map 'lab'"], 3)
-
-
-def test_verify_reads_the_frames(tmp_path: Path) -> None:
-    """In service and out of it; nothing is mended by looking."""
-    atlas = Directory(tmp_path / "data")
-    map_ = atlas.create("lab", ENCODER, 8, MapSettings(review=SETTING))
     for number in range(4):
-        assert map_.review.keep(bytes([number]) * 100, ANSWER, SETTING)
-    assert atlas.verify("lab").checked_bytes >= 400
-    atlas.close()
-    path = tmp_path / "data" / "maps" / "lab" / FILE
-    edit(path, "UPDATE review_frames SET answer = replace(answer, 'unknown', 'unknowm') WHERE number = 1")
-    edit(path, "UPDATE review_pictures SET bytes = x'FF' WHERE number = 2")
-    edit(path, "DELETE FROM review_pictures WHERE number = 3")
-    found = [
-        f"{FILE}: frame 1 does not match its checksum",
-        *(f"{FILE}: the picture of frame {number} does not match its digest" for number in (2, 3)),
+        review.keep(bytes([number]) * 100, ANSWER, SETTING)
+    review.close()
+    edit(
+        tmp_path / "data/maps/lab",
+        "UPDATE review_frames SET answer = replace(answer, 'unknown', 'unknowm') WHERE number = 1",
+        "UPDATE review_pictures SET bytes = x'FF' WHERE number = 2",
+        "DELETE FROM review_pictures WHERE number = 3",
+    )
+    review = frames_at(tmp_path)
+    assert [one.number for one in review.page(None, 10).frames] == [4, 3, 2]
+    for action in (review.find, lambda number: review.label(number, {"label": {}})):
+        with pytest.raises(StorageFailure, match="damaged"):
+            action(1)
+    for number in (2, 3):
+        with pytest.raises(StorageFailure, match="damaged"):
+            review.picture(number)
+    assert review.picture(4) == b"\x03" * 100
+    assert review.store.verify("lab").problems == [
+        "map.sqlite: frame 1 for review does not match its checksum",
+        *(f"map.sqlite: the picture of frame {number} for review does not match its digest" for number in (2, 3)),
     ]
-    atlas = Directory(tmp_path / "data")
-    assert atlas.verify("lab").problems == atlas.verify("lab").problems == found
-    assert inspect_folder(path.parent).problems == found
-    atlas.close()
-    path.write_bytes(b"no database at all" * 100)
-    (problem,) = inspect_folder(path.parent).problems
-    assert problem.startswith(FILE) and path.read_bytes()[:2] == b"no"
+    for number in (1, 2, 3):
+        review.discard(number)
+    assert review.store.verify("lab").ok
+    review.close()
 
 
 def test_kept_frames_go_with_their_map(tmp_path: Path) -> None:
@@ -217,7 +163,7 @@ def test_kept_frames_go_with_their_map(tmp_path: Path) -> None:
     map_ = atlas.create("lab", ENCODER, 8, MapSettings(review=SETTING))
     assert map_.review.keep(b"one", ANSWER, SETTING)
     folder = tmp_path / "data" / "maps" / "lab"
-    assert (folder / FILE).is_file() and atlas.verify("lab").ok
+    assert atlas.verify("lab").ok
     atlas.delete("lab")
     assert not folder.exists()
     with pytest.raises(UnknownMap):
