@@ -190,6 +190,10 @@ class StorageFailure(PlacerecError):
     """The disk refused a read or a write; a write was undone."""
 
 
+class TooManyOpenFiles(StorageFailure):
+    """The process or the machine has no file descriptor left; a write was undone."""
+
+
 class StoreUnavailable(StorageFailure):
     """The servers that keep the maps cannot be reached now, or refuse the service; a write was undone."""
 

@@ -190,6 +190,14 @@ class Settings(BaseSettings):
     max_stream_fragments: int = Field(
         default=1024, ge=1, le=1_000_000, description="Most fragments of one WebSocket message."
     )
+    open_maps: int | None = Field(
+        default=None,
+        ge=1,
+        le=100_000,
+        description="Maps that are open at the same time; the one used least makes room, and is opened again when it "
+        "is used. Each takes 5 file descriptors and 0.7 MB besides what it holds for searching. Default: at most 256, "
+        "as many as the descriptors of the process and a 64th of the memory suffice for.",
+    )
     max_maps: int = Field(default=1000, ge=1, le=100_000, description="Most maps of the data directory; then 409.")
     max_places: int = Field(default=10_000_000, ge=1, description="Most places of one map; then 409.")
     max_image_bytes: int = Field(default=16 * MIB, ge=1024, le=1024 * MIB, description="Largest frame, in bytes.")

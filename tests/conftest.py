@@ -20,7 +20,7 @@ settings.register_profile("any machine", deadline=None, suppress_health_check=[H
 settings.load_profile("any machine")
 
 LONGEST = (
-    "tests/core/storage/files/test_failed_sync.py",
+    "tests/core/store/test_failed_sync.py",
     "tests/service/upkeep/",
     "tests/service/places/",
     "tests/service/commands/",

@@ -15,10 +15,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from core.disk.permissions import PRIVATE_FILE, PRIVATE_FOLDER, open_private
-from core.errors import DataDirectoryLocked, PlacerecError, StorageFailure, StorageFull
+from core.errors import DataDirectoryLocked, PlacerecError, StorageFailure, StorageFull, TooManyOpenFiles
 
 DISK_IS_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """There is no space, no quota, or the file would exceed the process's limit on file sizes: making room helps."""
+
+NO_DESCRIPTOR = frozenset({errno.EMFILE, errno.ENFILE})
+"""The process, or the machine, has as many open files as it may have."""
 
 _SQLITE_IS_FULL = frozenset({sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE})
 _SQLITE_IS_DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT})
@@ -132,7 +135,21 @@ def is_full(error: sqlite3.Error) -> bool:
     return getattr(error, "sqlite_errorcode", None) in _SQLITE_IS_FULL
 
 
+def _lacks_descriptors(error: OSError | sqlite3.Error) -> bool:
+    if isinstance(error, OSError):
+        return error.errno in NO_DESCRIPTOR
+    if primary_code(error) != sqlite3.SQLITE_CANTOPEN:
+        return False
+    try:  # SQLite does not say why it cannot open a file
+        os.close(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+    except OSError as cause:
+        return cause.errno in NO_DESCRIPTOR
+    return False
+
+
 def _named(error: OSError | sqlite3.Error, action: str, database: str) -> Exception:
+    if _lacks_descriptors(error):
+        return TooManyOpenFiles(f"Too many files are open: could not {action}. Try again later.")
     if isinstance(error, OSError):
         if error.errno in DISK_IS_FULL:
             return StorageFull(f"The disk is full ({error.strerror}): could not {action}. Make room and try again.")
@@ -154,6 +171,7 @@ def disk_errors(action: str, database: str = "map.sqlite") -> Iterator[None]:
 
     Raises:
         StorageFull: there is no space or quota left, or the file may not grow.
+        TooManyOpenFiles: there is no file descriptor left.
         StorageFailure: any other error of the file system or of SQLite.
         Damage: SQLite finds its file damaged.
     """

@@ -1,4 +1,4 @@
-"""The status of a map: how it is searched, and its size on disk."""
+"""The status of a map: how it is searched, and its size."""
 
 from __future__ import annotations
 
@@ -41,25 +41,23 @@ class IndexStatus(BaseModel):
     setting: TierSetting = Field(description="The setting that its owner chose.")
     tier: Tier = Field(description="exact: every place compared; compact: codes first.")
     wanted: Tier = Field(description="The tier that the map's settings and size ask for.")
-    state: Literal["ready", "building", "unopened"] = Field(
-        description="Searches are answered in all; unopened: not used since the start, read from disk at its next use."
+    state: Literal["ready", "unopened"] = Field(
+        description="Searches are answered in both; unopened: not in memory, and read at its next use."
     )
-    progress: float = Field(ge=0, le=1, description="Of what is being built; 1 when ready.")
     rows_indexed: int = Field(ge=0, description="Rows with a code; the others are compared exactly.")
-    recall: Recall | None = Field(description="Against exact search; null in the tier exact and until it is measured.")
-    bytes_in_memory: int = Field(ge=0, description="Descriptors that are held, codes, and where the places are.")
-    problem: str | None = Field(
-        default=None, description="Why the last attempt to build came to no end; it is tried again with the next write."
+    recall: Recall | None = Field(
+        description="Against exact search, measured when the index is rebuilt; null before that, and in the tier exact."
     )
+    bytes_in_memory: int = Field(ge=0, description="Descriptors that are held, codes, and where the places are.")
 
 
 class ErasureReport(BaseModel):
-    """The leftovers of deleted places, and of former frames, that were overwritten or removed."""
+    """The leftovers of deleted places, and of former frames, that were erased."""
 
     model_config = ConfigDict(frozen=True)
 
-    rows: int = Field(ge=0, description="Descriptors that were overwritten, or whose files or rows were removed.")
-    bytes: int = Field(ge=0, description="Bytes of the descriptors, and those by which databases became smaller.")
+    rows: int = Field(ge=0, description="Frames of which descriptors, pictures and keypoints were still stored.")
+    bytes: int = Field(ge=0, description="Bytes by which the map's file became smaller; 0 in PostgreSQL.")
 
 
 class KeypointsStatus(BaseModel):
@@ -68,19 +66,19 @@ class KeypointsStatus(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     places: int = Field(ge=0, description="How many places have keypoints.")
-    bytes: int = Field(ge=0, description="Their size in map.sqlite.")
+    bytes: int = Field(ge=0, description="Their size.")
 
 
 class StorageStatus(BaseModel):
-    """The size of a map on disk."""
+    """The size of what is stored of a map."""
 
     model_config = ConfigDict(frozen=True)
 
     precision: str = Field(description="How descriptors are stored.")
-    bytes_per_place: int = Field(ge=0, description="All files of the map, a place; 0 for an empty map.")
-    descriptors: int = Field(ge=0, description="Bytes of the segment files, rows of forgotten places included.")
+    bytes_per_place: int = Field(ge=0, description="All that is stored of the map, a place; 0 for an empty map.")
+    descriptors: int = Field(ge=0, description="Bytes of descriptors and local descriptors.")
     index: int = Field(ge=0, description="Bytes of codes, which can be made again.")
-    database: int = Field(ge=0, description="Bytes of map.sqlite and its log: places, metadata, pictures, keypoints.")
-    keypoints: KeypointsStatus | None = Field(
-        description="The number of places with stored keypoints; null until the map is first used after a start."
+    database: int = Field(
+        ge=0, description="Bytes of all else: places, metadata, pictures, keypoints, frames for review, the log."
     )
+    keypoints: KeypointsStatus

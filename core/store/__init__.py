@@ -19,17 +19,19 @@ from core.store.snapshot import Ranking, Scope, Snapshot
 from core.store.store import Store
 
 if TYPE_CHECKING:
+    from core.index.milvus import Milvus
     from core.store.cluster import Cluster
 
 __all__ = ["Directory", "Map", "Ranking", "Scope", "Snapshot", "Store", "open_cluster"]
 
 
-def open_cluster(address: str, cache_bytes: int = 256 << 20) -> Cluster:
+def open_cluster(address: str, cache_bytes: int = 256 << 20, milvus: Milvus | None = None) -> Cluster:
     """All maps of a PostgreSQL database, which is connected to when it is first used, and again after an outage.
 
     Args:
         address: such as ``postgresql://placerec@localhost/placerec``.
         cache_bytes: most bytes of rows that are kept in memory.
+        milvus: has the codes of large maps; None: memory has those of all.
 
     Raises:
         MissingExtra: its client is not installed.
@@ -37,7 +39,7 @@ def open_cluster(address: str, cache_bytes: int = 256 << 20) -> Cluster:
     try:
         from core.store.cluster import Cluster
 
-        return Cluster(address, cache_bytes)
+        return Cluster(address, cache_bytes, milvus=milvus)
     except ModuleNotFoundError as error:
         if error.name not in ("psycopg", "psycopg_pool"):
             raise

@@ -8,6 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
 
 from core.errors import MapExists, StorageFailure, UnknownMap
 from core.ledger import Lock
@@ -18,6 +19,7 @@ from core.ledger.postgres import LONG_SECONDS, PostgresConnection, PostgresLedge
 from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, VerifyReport
 from core.maps.status import Progress, no_progress
+from core.store.following import ROWS_PER_SEGMENT
 from core.store.map import Map
 from core.store.rows import BYTES, RowCache
 from core.store.store import Store
@@ -41,6 +43,9 @@ WAIT_SECONDS = 10
 
 WRITING = 7061
 """The kind of the locks of the database by which writes to a map are paused; their number is that of the map."""
+
+if TYPE_CHECKING:
+    from core.index.milvus import Milvus
 
 log = logging.getLogger(__name__)
 
@@ -111,7 +116,7 @@ class MapRows:
                 connection.execute(f"VACUUM {table}")
         return 0
 
-    def check(self) -> list[str]:
+    def check(self, *tables: str) -> list[str]:
         """Nothing: PostgreSQL checks its pages itself, where its cluster was made so (``initdb --data-checksums``)."""
         return []
 
@@ -119,7 +124,13 @@ class MapRows:
 class Cluster(Store):
     """All maps of a PostgreSQL database, searched by FAISS in the memory of each service."""
 
-    def __init__(self, address: str, cache_bytes: int = BYTES) -> None:
+    def __init__(
+        self,
+        address: str,
+        cache_bytes: int = BYTES,
+        rows_per_segment: int = ROWS_PER_SEGMENT,
+        milvus: Milvus | None = None,
+    ) -> None:
         """Remember where PostgreSQL is; it is connected to when it is first used.
 
         Its tables are made if they are missing.
@@ -127,7 +138,10 @@ class Cluster(Store):
         Args:
             address: such as ``postgresql://placerec@localhost/placerec``.
             cache_bytes: most bytes of rows that are kept in memory.
+            rows_per_segment: of snapshots.
+            milvus: has the codes of large maps; None: memory has those of all.
         """
+        self._rows_per_segment, self.milvus = rows_per_segment, milvus
         self._maps: OrderedDict[int, Map] = OrderedDict()
         self._making = threading.Lock()
         self._closed = threading.Event()
@@ -183,7 +197,8 @@ class Cluster(Store):
         with self._making:
             found = self._maps.get(state.number)
             if found is None:
-                found = self._maps[state.number] = Map(MapRows(self.database, state.number), state, self._cache)
+                rows = MapRows(self.database, state.number)
+                found = self._maps[state.number] = Map(rows, state, self._cache, self.milvus, self._rows_per_segment)
                 while len(self._maps) > MOST_MAPS:
                     self._maps.popitem(last=False)
             self._maps.move_to_end(state.number)
@@ -236,6 +251,8 @@ class Cluster(Store):
         """
         self._expect_open()
         self.database.check()
+        if self.milvus is not None:
+            self.milvus.check()
 
     @property
     def open_maps(self) -> int:
@@ -293,10 +310,13 @@ class Cluster(Store):
             record.delete_map(connection)
         with self._making:
             self._maps.pop(found.number, None)
+        self._drop_codes(found.record)
 
     def close(self) -> None:
         """Close the connections, and refuse further reads and writes."""
         self._closed.set()
+        for found in list(self._maps.values()):
+            found.end()
         self.database.close()
 
     def _expect_open(self) -> None:

@@ -53,5 +53,5 @@ class MapDatabase(Protocol):
             MapBusy: it is being read.
         """
 
-    def check(self) -> list[str]:
-        """What the database itself finds damaged."""
+    def check(self, *tables: str) -> list[str]:
+        """What the database itself finds damaged in some tables; none: in all, and in what is free."""

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from core.disk.files import Damage, FolderLock, check_writable, disk_errors, make_folder, sync_folder, write_file
 from core.disk.permissions import PRIVATE_FOLDER
@@ -24,6 +25,7 @@ from core.errors import (
     DataDirectoryTooOld,
     MapExists,
     MapQuarantined,
+    PlacerecError,
     StorageFailure,
     StorageFull,
     UnknownMap,
@@ -37,6 +39,9 @@ from core.store.map import Map
 from core.store.rows import RowCache
 from core.store.store import Store
 from core.store.verification import inspect
+
+if TYPE_CHECKING:
+    from core.index.milvus import Milvus
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +75,7 @@ class Directory(Store):
         most_open: int = MOST_OPEN,
         cache_bytes: int = CACHE_BYTES,
         rows_per_segment: int = ROWS_PER_SEGMENT,
+        milvus: Milvus | None = None,
     ) -> None:
         """Lock the directory, make it if it is missing, and read the record of every map.
 
@@ -77,6 +83,7 @@ class Directory(Store):
             most_open: maps that are open together; those used least are closed for others.
             cache_bytes: most bytes of rows that are kept in memory.
             rows_per_segment: of snapshots.
+            milvus: has the codes of large maps; None: memory has those of all.
 
         Raises:
             DataDirectoryLocked: another process uses it.
@@ -86,18 +93,15 @@ class Directory(Store):
         """
         self._directory = directory
         self._folder = directory / _MAPS
-        self._rows_per_segment, self._cache, self._open_files = (
-            rows_per_segment,
-            RowCache(cache_bytes),
-            OpenFiles(most_open),
-        )
+        self._rows_per_segment, self._cache = rows_per_segment, RowCache(cache_bytes)
+        self._open_files, self.milvus = OpenFiles(most_open), milvus
         self._making = threading.Lock()  # held while a map is made or deleted
         self._maps: dict[str, Map] = {}
         self._unlisted: dict[str, Map] = {}
         self._reserved: set[str] = set()
         # Maps that could not be read at the start, and why: damaged files, or errors of the disk.
         self._damaged: dict[str, str] = {}
-        self._refused: dict[str, str] = {}
+        self._refused: dict[str, PlacerecError] = {}
         self._closed = False
         with disk_errors(f"open the data directory {directory}"):
             make_folder(directory)
@@ -162,7 +166,7 @@ class Directory(Store):
         except (StorageFull, StorageFailure) as refusal:
             # The other maps are served; this one is tried again when it is used.
             log.error("Map %s cannot be opened: %s", folder.name, refusal)
-            self._refused[folder.name] = str(refusal)
+            self._refused[folder.name] = refusal
 
     def _make(self, made: MapRecord, unlisted: bool) -> Map:
         with self._making, disk_errors(f"create map {made.id!r}"):
@@ -197,7 +201,7 @@ class Directory(Store):
                 raise Damage(f"{FILE}: it belongs to the map {state.record.id!r}")
         finally:
             file.rest()
-        made = Map(file, state, self._cache, self._rows_per_segment)
+        made = Map(file, state, self._cache, self.milvus, self._rows_per_segment)
         file.rested = made.rest
         return made
 
@@ -301,14 +305,19 @@ class Directory(Store):
         Raises:
             UnknownMap, MapQuarantined, StorageFailure.
         """
-        found = self.find(map_id)
+        found = self._touched(self.find(map_id))
         found.open()
+        return found
+
+    def _touched(self, found: Map) -> Map:
+        assert isinstance(found.database, MapFile)
+        found.database.touch()
         return found
 
     def opened(self, map_id: str) -> Map | None:
         """A map that is in service and was read from disk before; None otherwise.  This never waits."""
         found = self._maps.get(map_id)
-        return found if found is not None and found.is_open else None
+        return self._touched(found) if found is not None and found.is_open else None
 
     def find(self, map_id: str) -> Map:
         """A map whose record and number of places can be used without reading it from disk.
@@ -327,9 +336,9 @@ class Directory(Store):
         found.expect_there()
         return found
 
-    def _absent(self, map_id: str) -> UnknownMap | MapQuarantined | StorageFailure:
-        if reason := self._refused.get(map_id):
-            return StorageFailure(reason)
+    def _absent(self, map_id: str) -> PlacerecError:
+        if refusal := self._refused.get(map_id):
+            return type(refusal)(*refusal.args)
         if reason := self._damaged.get(map_id):
             return MapQuarantined(f"Map {map_id!r} is damaged and out of service: {reason}.")
         return UnknownMap(f"There is no map {map_id[:80]!r}.")
@@ -351,7 +360,8 @@ class Directory(Store):
     def quarantined(self) -> dict[str, str]:
         in_use = {map_id: found.damage for map_id, found in self._maps.copy().items()}
         found_later = {map_id: reason for map_id, reason in in_use.items() if reason is not None}
-        return {**self._damaged, **self._refused, **found_later}
+        refused = {map_id: str(refusal) for map_id, refusal in self._refused.items()}
+        return {**self._damaged, **refused, **found_later}
 
     def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:
         with suppress(MapQuarantined):
@@ -376,6 +386,8 @@ class Directory(Store):
             self._refused.pop(map_id, None)
         # Files that cannot be deleted now are deleted at the next start.
         shutil.rmtree(removed, ignore_errors=True)
+        if found is not None:
+            self._drop_codes(found.record)
 
     def check_writable(self) -> None:
         """Write, sync and delete a small file, to see that maps could be written.
@@ -385,6 +397,8 @@ class Directory(Store):
         """
         self._expect_open()
         check_writable(self._directory)
+        if self.milvus is not None:
+            self.milvus.check()
 
     @property
     def open_maps(self) -> int:

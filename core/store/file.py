@@ -19,7 +19,7 @@ from core.disk.files import Damage, disk_errors, is_full, sync_file, sync_folder
 from core.disk.permissions import PRIVATE_FOLDER
 from core.disk.sqlite_file import DURABLE, NotOurs, Schema, UnreadVersion, rewrite, transaction
 from core.disk.write_ahead_log import check_log
-from core.errors import MapBusy
+from core.errors import MapBusy, UnknownMap
 from core.ledger.maps import record
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.record import MapState
@@ -33,13 +33,12 @@ FILE = "map.sqlite"
 _IDLE_READERS = 4
 _LOG_BYTES = 64 << 20  # a log that a large batch made longer is cut to this size
 _SETTINGS = {
-    "page_size": 8192,
-    "auto_vacuum": "INCREMENTAL",
     **DURABLE,
     "secure_delete": "ON",
     "temp_store": "MEMORY",
     "journal_size_limit": _LOG_BYTES,
 }
+_NEW = {"page_size": 8192, "auto_vacuum": "INCREMENTAL", **_SETTINGS}  # fixed when a file gets its first table
 _SCHEMA = Schema(TABLES.application_id, TABLES.version, TABLES.create("sqlite"))
 
 
@@ -55,7 +54,7 @@ def create(folder: Path, made: MapRecord) -> None:
         OSError, sqlite3.Error: the disk refuses.
     """
     folder.mkdir(PRIVATE_FOLDER)
-    driver = sqlite_file.connect(folder / FILE, "rwc", _SETTINGS)
+    driver = sqlite_file.connect(folder / FILE, "rwc", _NEW)
     try:
         _SCHEMA.prepare(driver, create=True)
         with transaction(driver):
@@ -95,6 +94,12 @@ class OpenFiles:
         with self._lock:
             for other in in_use:
                 self._files.setdefault(other)
+
+    def touch(self, file: MapFile) -> None:
+        """Note the use of what is in memory of a file, if it is open."""
+        with self._lock:
+            if file in self._files:
+                self._files.move_to_end(file)
 
     def drop(self, file: MapFile) -> None:
         """Note that a file is closed."""
@@ -144,8 +149,6 @@ class MapFile:
             driver = sqlite_file.connect(self.path, settings=_SETTINGS)
             try:
                 prepare(driver, str(self.path))
-                sqlite_file.expect_writable(driver)
-                sync_folder(self.folder)  # the name of SQLite's log
             except BaseException:
                 driver.close()
                 raise
@@ -214,6 +217,8 @@ class MapFile:
         with self._lock, self._used(), disk_errors(f"write to map {self.folder.name!r}", FILE):
             if self._writer is None:
                 self._writer = self._connected()
+                sqlite_file.expect_writable(self._writer)
+                sync_folder(self.folder)  # the name of SQLite's log
             driver, committing = self._writer, False
             if self._doubtful:
                 self._empty_log(driver)
@@ -248,6 +253,10 @@ class MapFile:
         sync_file(self.path.with_name(f"{FILE}-wal"))  # or a power cut could restore its former content
         self._doubtful = False
 
+    def touch(self) -> None:
+        """Note that the map is used, whether or not that needs its file."""
+        self._open_files.touch(self)
+
     def rest(self) -> bool:
         """Close the file until its next use; False if it is in use."""
         if not self._lock.acquire(blocking=False):
@@ -257,6 +266,7 @@ class MapFile:
                 if self._using:
                     return False
                 self._close_connections()
+                self._open_files.drop(self)
         finally:
             self._lock.release()
         self.rested()
@@ -288,8 +298,11 @@ class MapFile:
         Raises:
             Damage: it is not a map, or another one than its folder says.
         """
-        with self.glancing() as connection:
-            return record.state_of(connection, self.folder.name)
+        try:
+            with self.glancing() as connection:
+                return record.state_of(connection, self.folder.name)
+        except UnknownMap as error:
+            raise Damage(f"{FILE} has no record of a map") from error
 
     def room(self) -> int:
         """The bytes of the file and its log."""
@@ -313,10 +326,11 @@ class MapFile:
                 raise MapBusy("The map is being read, by an export or a check: erase it later.") from error
             return max(0, before - self.path.stat().st_size)
 
-    def check(self) -> list[str]:
-        """What SQLite finds damaged."""
+    def check(self, *tables: str) -> list[str]:
+        """What SQLite finds damaged in some tables; none: in the whole file."""
         with self._reader("read") as driver:
-            return [line for (line,) in driver.execute("PRAGMA integrity_check").fetchall() if line != "ok"]
+            checks = [f"PRAGMA integrity_check({table})" for table in tables] or ["PRAGMA integrity_check"]
+            return [line for check in checks for (line,) in driver.execute(check) if line != "ok"]
 
 
 def prepare(driver: sqlite3.Connection, file: str = FILE) -> None:
@@ -340,18 +354,23 @@ def prepare(driver: sqlite3.Connection, file: str = FILE) -> None:
         raise error.refusal(file) from error
     found = _columns(driver)
     for table, columns in _expected().items():
-        if missing := columns - found.get(table, frozenset()):
+        if missing := columns - found.get(table, set()):
             raise Damage(f"{FILE} lacks {', '.join(sorted(missing))} of its table {table!r}")
 
 
-def _columns(driver: sqlite3.Connection) -> dict[str, frozenset[str]]:
-    tables = driver.execute("SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
-    query = "SELECT name FROM pragma_table_info(?)"
-    return {name: frozenset(one for (one,) in driver.execute(query, (name,))) for (name,) in tables.fetchall()}
+def _columns(driver: sqlite3.Connection) -> dict[str, set[str]]:
+    query = (
+        "SELECT tables.name, columns.name FROM sqlite_schema AS tables, pragma_table_info(tables.name) AS columns"
+        " WHERE tables.type = 'table'"
+    )
+    found: dict[str, set[str]] = {}
+    for table, column in driver.execute(query).fetchall():
+        found.setdefault(table, set()).add(column)
+    return found
 
 
 @cache
-def _expected() -> dict[str, frozenset[str]]:
+def _expected() -> dict[str, set[str]]:
     driver = sqlite3.connect(":memory:", isolation_level=None)
     try:
         _SCHEMA.prepare(driver, create=True)

@@ -10,10 +10,13 @@ cached rows included, and reads it anew.
 from __future__ import annotations
 
 import gc
+import hashlib
 import logging
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, cast
 from weakref import WeakSet
 
 import numpy as np
@@ -37,6 +40,9 @@ from core.store.segment import HeldRows, Location, Segment
 from core.store.snapshot import Snapshot
 from core.store.tiers import holds_for, tier_for
 
+if TYPE_CHECKING:
+    from core.index.milvus import Milvus, MilvusCodes
+
 log = logging.getLogger(__name__)
 
 ROWS_PER_SEGMENT = 1024
@@ -47,6 +53,12 @@ CODES_AT_ONCE = 4096
 
 DESCRIPTORS_AT_ONCE = 256
 """Descriptors that are read at a time."""
+
+IN_MILVUS_FROM = 100_000
+"""From this number of frames on, the codes of a map are in Milvus, where there is one."""
+
+MOST_BEHIND = 64
+"""Rows that may be compared one by one before Milvus is given them."""
 
 _NOWHERE = Location(NO_POSE, (0.0, 0.0, 0.0), NO_SEQUENCE, 0)
 
@@ -68,13 +80,20 @@ class FollowedMap:
         database: of the map.
         glancing: begins to read the map by single statements.
         cache: of rows of all maps.
+        milvus: has the codes of large maps; None: memory has those of all.
         rows_per_segment: of its snapshots.
     """
 
     def __init__(
-        self, database: MapDatabase, glancing: Reading, cache: RowCache, rows_per_segment: int = ROWS_PER_SEGMENT
+        self,
+        database: MapDatabase,
+        glancing: Reading,
+        cache: RowCache,
+        milvus: Milvus | None = None,
+        rows_per_segment: int = ROWS_PER_SEGMENT,
     ) -> None:
         self._database, self._glancing, self._cache, self._per_segment = database, glancing, cache, rows_per_segment
+        self._milvus = milvus
         self._lock = threading.RLock()
         self._joining = threading.Lock()
         self._held: Followed | None = None
@@ -100,7 +119,9 @@ class FollowedMap:
     def as_of(self, state: MapState) -> Followed | None:
         """The snapshot that is held, if it shows this state; else None."""
         held = self._held
-        return held if held is not None and (held.revision, held.stamp) == (state.revision, state.stamp) else None
+        if held is None or (held.revision, held.stamp) != (state.revision, state.stamp):
+            return None
+        return None if (table := held.snapshot.table) is not None and table.is_lost else held
 
     def up_to_date(self, connection: MapConnection, state: MapState) -> Followed:
         """The snapshot of a state of the map that was read in this transaction."""
@@ -124,8 +145,9 @@ class FollowedMap:
             source, snapshot = held.source, self._with_changes(connection, state, held)
         self._given.add(snapshot)
         self._held = now = Followed(snapshot, state.revision, state.stamp, source)
-        if snapshot.table is not None and snapshot.table.is_loose:
-            threading.Thread(target=self._join, name="index", daemon=True).start()
+        work = self._hand_over if self._is_for_milvus(snapshot) else self._join if _is_loose(snapshot) else None
+        if work is not None and not self._joining.locked():
+            threading.Thread(target=work, args=(state.record,), name="index", daemon=True).start()
         return now
 
     def _follows(self, connection: MapConnection, held: Followed) -> bool:
@@ -140,6 +162,8 @@ class FollowedMap:
     def _outgrown(self, state: MapState, snapshot: Snapshot) -> bool:
         """Whether a map is to be searched in another way than it is."""
         setting, count, present = state.record.index, state.searched, tier_of(snapshot)
+        if snapshot.table is not None and snapshot.table.is_lost:
+            return True
         return (tier_for(setting, count, present), holds_for(setting, count, snapshot.holds)) != (
             present,
             snapshot.holds,
@@ -252,25 +276,75 @@ class FollowedMap:
 
     # Larger blocks of codes
 
-    def _join(self) -> None:
+    def _join(self, record: MapRecord) -> None:
         """Join blocks of codes, so that a search need not read every code; searches go on meanwhile."""
-        if not self._joining.acquire(blocking=False):
-            return
-        try:
-            while (held := self._held) is not None and (table := held.snapshot.table) is not None:
-                block = table.joined()
-                if block is None:
+        with self._working(record, "codes could not be joined; searches read all of them"):
+            while (held := self._held) is not None and isinstance(table := held.snapshot.table, CodeTable):
+                if (block := table.joined()) is None:
                     return
-                with self._lock:
-                    now = self._held
-                    if now is None or now.source is not held.source or now.snapshot.table is None:
-                        return
-                    self._held = replace(now, snapshot=now.snapshot.with_block(block))
-                    self._given.add(self._held.snapshot)
-        except Exception:
-            log.exception("The codes of a map could not be joined; searches read all of them")
-        finally:
-            self._joining.release()
+                self._replace(held, lambda now, block=block: now.with_block(block))  # type: ignore[misc]
+
+    # A Milvus
+
+    def _is_for_milvus(self, snapshot: Snapshot) -> bool:
+        """Whether Milvus lacks rows of a map whose codes it is to have."""
+        if self._milvus is None or (table := snapshot.table) is None or len(snapshot) < IN_MILVUS_FROM:
+            return False
+        return isinstance(table, CodeTable) or snapshot.rows - len(table) >= MOST_BEHIND
+
+    def _hand_over(self, record: MapRecord) -> None:
+        """Give Milvus the rows that it lacks, and search them there; searches go on as they are meanwhile."""
+        with self._working(record, "descriptors could not be given to Milvus"):
+            if (held := self._held) is None or self._milvus is None:
+                return
+            snapshot, table = held.snapshot, held.snapshot.table
+            living = np.flatnonzero(snapshot.alive)
+            if table is None or isinstance(table, CodeTable):
+                last = int(living[-1]), snapshot.descriptors_at(living[-1:])[0]
+                codes = self._milvus.codes(uid_of(record), record.dimension, snapshot.rows, last)
+            else:
+                codes = cast("MilvusCodes", table)
+            missing = living[living >= len(codes)]
+            parts = (missing[at : at + DESCRIPTORS_AT_ONCE] for at in range(0, len(missing), DESCRIPTORS_AT_ONCE))
+            pairs = (pair for part in parts for pair in zip(part.tolist(), snapshot.descriptors_at(part), strict=True))
+            made = codes.brought_up(pairs, snapshot.rows)
+            self._replace(held, lambda now: replace(now, table=made))
+
+    def erase(self, record: MapRecord, dead: Sequence[int]) -> None:
+        """Have Milvus forget rows that no place has any more, and read the map anew, for memory has them as well.
+
+        Raises:
+            StoreUnavailable: Milvus cannot be reached.
+        """
+        if self._milvus is not None:
+            self._milvus.delete(uid_of(record), dead)
+        self.forget()
+
+    @contextmanager
+    def _working(self, record: MapRecord, failure: str) -> Iterator[None]:
+        """Work in the background, one thread at a time; what fails is logged, and tried again after another write."""
+        with self._joining:
+            try:
+                yield
+            except Exception:
+                log.exception("Map %s: %s", record.id, failure)
+
+    def _replace(self, held: Followed, change: Callable[[Snapshot], Snapshot]) -> None:
+        """Publish a change of the snapshot, unless the map was read anew since it was ``held``."""
+        with self._lock:
+            now = self._held
+            if now is not None and now.source is held.source and now.snapshot.table is not None:
+                self._held = replace(now, snapshot=change(now.snapshot))
+                self._given.add(self._held.snapshot)
+
+
+def uid_of(record: MapRecord) -> str:
+    """The name of a map in Milvus; a later map of the same id has another one."""
+    return hashlib.sha256(f"{record.id} {record.created_at.isoformat()}".encode()).hexdigest()[:32]
+
+
+def _is_loose(snapshot: Snapshot) -> bool:
+    return isinstance(snapshot.table, CodeTable) and snapshot.table.is_loose
 
 
 def tier_of(snapshot: Snapshot) -> Tier:

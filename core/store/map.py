@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from core.disk.files import Damage
 from core.errors import MapBusy, MapQuarantined, PlacerecError, StorageFailure, UnknownMap
@@ -14,6 +15,7 @@ from core.geometry.keypoints import Keypoints, keypoints_of
 from core.index import Coder
 from core.ledger.maps import frames, places, record, rows
 from core.ledger.maps.archiving import Exporter
+from core.ledger.maps.checksums import DamagedRow
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.map import LedgerMap
 from core.ledger.maps.record import MapState
@@ -39,8 +41,11 @@ from core.store.recall import measure_recall
 from core.store.rows import RowCache
 from core.store.scopes import Chooser
 from core.store.snapshot import Scope, Snapshot
-from core.store.tiers import tier_for
-from core.store.verification import inspect
+from core.store.tiers import holds_for, tier_for
+from core.store.verification import damage_of_places, inspect
+
+if TYPE_CHECKING:
+    from core.index.milvus import Milvus
 
 log = logging.getLogger(__name__)
 
@@ -89,15 +94,21 @@ class Map(LedgerMap):
         database: of the map.
         state: in which it was found.
         cache: of rows of all maps.
+        milvus: has the codes of large maps; None: memory has those of all.
         rows_per_segment: of its snapshots.
     """
 
     def __init__(
-        self, database: MapDatabase, state: MapState, cache: RowCache, rows_per_segment: int = ROWS_PER_SEGMENT
+        self,
+        database: MapDatabase,
+        state: MapState,
+        cache: RowCache,
+        milvus: Milvus | None = None,
+        rows_per_segment: int = ROWS_PER_SEGMENT,
     ) -> None:
         self.database, self._state, self._cache = database, state, cache
         self._noted = (-1.0, state)  # the last state that was read, and when it was asked for
-        self._followed = FollowedMap(database, self._glancing, cache, rows_per_segment)
+        self._followed = FollowedMap(database, self._glancing, cache, milvus, rows_per_segment)
         self._room: tuple[object, StorageStatus] | None = None
         self._recent_places = RecentPlaces()
         self._damage: str | None = None
@@ -231,13 +242,33 @@ class Map(LedgerMap):
         """All places at this moment; later writes do not change the snapshot."""
         if (held := self._followed.as_of(self.latest())) is not None:
             return held.snapshot
+        self._expect_sound()
         with self.viewing() as (connection, state):
             return self._followed.up_to_date(connection, state).snapshot
+
+    def _expect_sound(self) -> None:
+        """Check the places of a small map in a file, and what they are found by, before it is read.
+
+        An SQLite file has no checksums of its own.  Of a larger map, rows are checked when they are read.
+        """
+        if self.database.shared or self._followed.held is not None:
+            return
+        with self.viewing() as (connection, state):
+            if not holds_for(state.record.index, state.searched, True):
+                return
+            if problem := next(damage_of_places(self.database, connection), None):
+                raise DamagedRow(problem)
+            stale = places.stale_tokens(connection)
+        if stale:  # it can be made again from the places, which are sound
+            log.warning("The index of the metadata of map %s is rebuilt: %s.", self.record.id, stale[0])
+            with self._transaction() as connection:
+                places.rebuild_tokens(connection)
 
     def scope(self, selection: Selection | None = None) -> Scope:
         """The places that a query may find at this moment; None: all."""
         if not selection:
             return Scope(self.snapshot())
+        self._expect_sound()
         with self.viewing() as (connection, state):
             return Chooser(self._followed.up_to_date(connection, state).snapshot, connection).scope(selection)
 
@@ -287,7 +318,6 @@ class Map(LedgerMap):
             tier=tier,
             wanted=tier_for(setting, count, tier),
             state="unopened" if held is None else "ready",
-            progress=0 if held is None else 1,
             rows_indexed=0 if held is None else held.snapshot.coded,
             recall=recall,
             bytes_in_memory=0 if held is None else held.snapshot.memory,
@@ -341,7 +371,9 @@ class Map(LedgerMap):
                 threading.Event().wait(0.05 if not self.database.shared else 1)
         with self._guarded():
             freed = self.database.erase()
-        self._followed.forget()  # what is in memory still has them
+        with self._reading() as connection:
+            dead = rows.dead_since(connection, -1)
+        self._followed.erase(self.record, dead)
         self._room = None
         return ErasureReport(rows=total, bytes=freed)
 
@@ -356,7 +388,8 @@ class Map(LedgerMap):
             if self._room is None or self._room[0] != key:
                 count, keypoints, pictures = frames.room(connection)
                 descriptors = state.searched * Form.of(state.record).frame.itemsize
-                codes = state.searched * Coder.of(state.record.dimension).bytes_per_place
+                coded = tier_for(state.record.index, state.searched, "exact") == "compact"
+                codes = state.searched * Coder.of(state.record.dimension).bytes_per_place if coded else 0
                 known = descriptors + codes + keypoints + pictures
                 whole = self.database.room() or known
                 status = StorageStatus(

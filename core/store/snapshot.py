@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from core.index import Codes, CodeTable
 from core.index.flat import Vectors, ranked, vectors
-from core.index.table import Block
+from core.index.table import Block, FirstStage
 from core.maps.forms import NO_LOCAL, Descriptor, Local
 from core.places import Neighborhood, Whereabouts
 from core.store.rows import Rows
@@ -75,7 +75,7 @@ class Snapshot:
 
     dimension, rows_per_segment, local_shape: of the map; ``local_shape`` is (C, L).
     source: reads the descriptors of segments that hold none in memory.
-    table: codes of the first ``len(table)`` rows; None in a map that is searched exactly.
+    table: has the codes of the first ``len(table)`` rows; None in a map that is searched exactly.
     holds: whether descriptors are held in memory, those of new rows too.
     halves: descriptors in memory are in half precision, in which they are also stored.
     """
@@ -85,7 +85,7 @@ class Snapshot:
     segments: tuple[Segment, ...] = ()
     local_shape: tuple[int, int] = NO_LOCAL
     source: Rows | None = None
-    table: CodeTable | None = None
+    table: FirstStage | None = None
     holds: bool = True
     halves: bool = False
 
@@ -336,7 +336,7 @@ class Snapshot:
 
     def with_block(self, block: Block) -> Snapshot:
         """The snapshot with a block that :meth:`CodeTable.joined` made of some of its codes."""
-        assert self.table is not None
+        assert isinstance(self.table, CodeTable)
         return replace(self, table=self.table.with_block(block))
 
 

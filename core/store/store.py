@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
 
+from core.errors import StoreUnavailable
 from core.maps.archives.reading import Archive
 from core.maps.archives.unpacking import check_sizes
 from core.maps.enrolling import CheckDescriptors, any_descriptors
@@ -13,12 +16,31 @@ from core.maps.forms import HALF, NO_LOCAL, Form
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.maps.status import Progress, no_progress
 from core.places import check_map_id
+from core.store.following import uid_of
 from core.store.importing import Importing
 from core.store.map import Map
 
+if TYPE_CHECKING:
+    from core.index.milvus import Milvus
+
+log = logging.getLogger(__name__)
+
 
 class Store(ABC):
-    """Maps by id.  Any thread may call any method."""
+    """Maps by id.  Any thread may call any method.
+
+    milvus: has the codes of large maps; None: memory has those of all.
+    """
+
+    milvus: Milvus | None
+
+    def _drop_codes(self, gone: MapRecord) -> None:
+        """Have Milvus drop the codes of a map that was deleted; if it cannot be reached, they are of no use there."""
+        if self.milvus is not None:
+            try:
+                self.milvus.drop(lambda uid: uid == uid_of(gone))
+            except StoreUnavailable as error:
+                log.warning("Milvus keeps the codes of map %s, which was deleted: %s", gone.id, error)
 
     def create(
         self,

@@ -26,6 +26,9 @@ from core.store.following import Followed
 AT_ONCE = 64
 """Places that are read together."""
 
+CHECKED_TABLES = ("maps", "places", "tokens", "sequences", "cameras", "dead_rows", "review_frames")
+"""The tables that SQLite checks when a map is opened; long values are checked when they are read."""
+
 _MOST_LISTED = 10  # damaged rows of one kind that are listed one by one; further ones are counted
 
 
@@ -98,6 +101,7 @@ class _Inspection:
             self._note("", [f"its record counts {counted}, but there are {self._places} and {looks}"])
         if strays := rows.of_no_place(connection):
             self._note("", [f"the descriptors, pictures or keypoints of {len(strays)} rows belong to no place"])
+        self._note("rows", [f"row {row} has a place and is noted as dead" for row in rows.dead_of_places(connection)])
         columns = read_columns(connection, state.rows)
         if (held := self._held) is None or (held.revision, held.stamp) != (state.revision, state.stamp):
             return  # it was written to meanwhile
@@ -198,6 +202,13 @@ class _Inspection:
             self._bytes += len(picture or b"")
             if picture is None or hashlib.sha256(picture).digest() != digest:
                 self._note("", [f"the picture of frame {number} for review does not match its digest"])
+
+
+def damage_of_places(database: MapDatabase, connection: MapConnection) -> Iterator[str]:
+    """What is damaged of the places of a map and of its sequences, without what is stored of their frames."""
+    yield from database.check(*CHECKED_TABLES)
+    yield from (f"place {place_id!r} does not match its checksum" for place_id in places.unsound(connection))
+    yield from wrong_references(connection)
 
 
 def wrong_references(connection: MapConnection) -> list[str]:

@@ -74,7 +74,7 @@ class RuntimeCollector(Collector):
 
     def _maps(self) -> Iterable[Metric]:
         """Counts by tier; a label with the name of each map would make too many series."""
-        tiers, building, open_ = Counter[str](), 0, 0
+        tiers = Counter[str]()
         records: list[MapRecord] = []
         with suppress(PlacerecError):
             records = self._runtime.engine.all_records()
@@ -82,18 +82,16 @@ class RuntimeCollector(Collector):
             with suppress(PlacerecError):  # it was deleted or found to be damaged since it was listed
                 map_ = self._runtime.engine.maps.find(record.id)
                 if map_.is_open:
-                    status = map_.index_status()
-                    open_ += 1
-                    tiers[status.tier] += 1
-                    building += status.state == "building"
+                    tiers[map_.index_status().tier] += 1
         gauge = GaugeMetricFamily(
             "placerec_maps_searched", "Open maps, by the tier in which they are searched.", labels=["tier"]
         )
         for tier in get_args(Tier):
             gauge.add_metric([tier], tiers[tier])
         yield gauge
-        yield _gauge("placerec_indexes_building", "Open maps whose index is being built.", building)
-        yield _gauge("placerec_maps_open", "Open maps; a map is opened by its first query.", open_)
+        engine = self._runtime.engine
+        yield _gauge("placerec_maps_open", "Open maps; a map is opened when it is used.", engine.maps.open_maps)
+        yield _gauge("placerec_maps_open_limit", "Maps that may be open at the same time.", engine.most_open_maps)
 
 
 @contextmanager

@@ -15,11 +15,12 @@ from starlette.responses import Response
 
 from service.app.documentation import PAGE, documentation_file
 from service.app.runtime import Runtime
-from service.app.schemas import EncoderPage, Health, Readiness, Version
+from service.app.schemas import EncoderPage, Health, OpenState, Readiness, Version
 from service.errors.faults import NotReady
 from service.errors.problems import problem_documentation
 from service.http.routing import EngineDep, FromState, PrincipalDep, single_values
 from service.maps.schemas import QuarantinedMap
+from service.open_files import most_open_files, open_files
 from service.worker_threads import in_thread
 
 RuntimeDep = Annotated[Runtime, Depends(FromState("runtime"))]
@@ -42,13 +43,20 @@ async def check_readiness(runtime: RuntimeDep, principal: PrincipalDep) -> Readi
     """
     found = await runtime.check_readiness()
     found.require(principal.confided)
-    damaged = runtime.engine.maps.quarantined().items()
+    engine = runtime.engine
+    damaged = engine.maps.quarantined().items()
     quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
     return Readiness(
         degraded=None if found.degraded is None else found.degraded.told(principal.confided),
         checks=found.told_checks(principal.confided),
         encoder=runtime.settings.encoder,
         quarantined=quarantined,
+        open=OpenState(
+            maps=engine.maps.open_maps,
+            most_maps=engine.most_open_maps,
+            files=open_files(),
+            most_files=most_open_files(),
+        ),
     )
 
 

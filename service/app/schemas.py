@@ -24,6 +24,15 @@ class Health(BaseModel):
     status: Literal["ok"] = "ok"
 
 
+class OpenState(BaseModel):
+    """What is open, and how much may be."""
+
+    maps: int = Field(description="Open maps; the others are opened when they are used.")
+    most_maps: int = Field(description="One more makes the map that was used least close.")
+    files: int | None = Field(description="Descriptors of the process; null where the system does not report it.")
+    most_files: int = Field(description="Descriptors that the process may have.")
+
+
 class Readiness(BaseModel):
     """The service is ready for requests."""
 
@@ -34,6 +43,7 @@ class Readiness(BaseModel):
     checks: dict[str, str] = Field(description="Each is `ok`, or a sentence that says what is wrong.")
     encoder: str
     quarantined: list[QuarantinedMap]
+    open: OpenState
 
 
 class Version(BaseModel):

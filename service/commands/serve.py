@@ -53,12 +53,14 @@ def _serve_logged(settings: Settings) -> None:
     from service.app.application import create_app
     from service.http.connections import Connections
     from service.http.server import CannotListen, serve_application
+    from service.open_files import raise_limit
     from service.settings import SettingsError
     from service.telemetry.requests import configure_logging
 
     gc.freeze()  # all of it lives as long as the process, so the garbage collector need not go through it
     gc.enable()
     configure_logging(settings.log_level)
+    raise_limit(settings)
     try:
         application = create_app(settings)
     except SettingsError as error:

@@ -103,6 +103,7 @@ class Engine:
         self.settings, self.metrics = settings, metrics
         self._store = OpenStore(settings)
         self.maps: Store = self._store.maps
+        self.most_open_maps = self._store.most_open
         self.catalogue = EncoderCatalogue(settings.models_directory, settings.device)
         limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
         self.queue = EncoderQueue(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
@@ -213,7 +214,7 @@ class Engine:
         return self.catalogue.resolve(name_or_identity or self.settings.encoder)
 
     async def map(self, map_id: str) -> Map:
-        """A map, which is opened from disk if it is not open yet.
+        """A map, which is read if it is not open yet.
 
         Raises:
             UnknownMap: there is no map of this id.
@@ -232,7 +233,7 @@ class Engine:
         Raises:
             UnknownCamera: the map has no camera of the question's name.
             QueueFull: too many requests are waiting.
-            StorageFailure: the map's files cannot be read.
+            StorageFailure: the map cannot be read.
             Others: see ``EncoderQueue.encode``.
         """
         mask = await camera_mask(map_, question.camera)

@@ -67,12 +67,12 @@ def rehearse(encoder: Encoder) -> None:
 
 def _rehearse(encoder: Encoder) -> None:
     with tempfile.TemporaryDirectory(prefix="placerec-rehearsal-") as folder:
-        atlas = Directory(Path(folder))
+        maps = Directory(Path(folder))
         try:
             shape = encoder.local_shape
-            _rehearse_in(atlas.create("rehearsal", encoder.identity, encoder.dimension, local_shape=shape), encoder)
+            _rehearse_in(maps.create("rehearsal", encoder.identity, encoder.dimension, local_shape=shape), encoder)
         finally:
-            atlas.close()
+            maps.close()
     shared_stretches(of_matrix(np.eye(LEAST_FRAMES, dtype=np.float32)), LEAST_FRAMES, LEAST_FRAMES)
     # Loops that only compressed maps and encoders without a projection use.
     descriptors = np.ones((1, encoder.dimension), np.float32)

@@ -110,7 +110,7 @@ class Searches:
             frames: they have their pixels, or scaled ones, where they may be verified.
 
         Raises:
-            StorageFailure: the map's files cannot be read.
+            StorageFailure: the map cannot be read.
         """
         seen = [frame for frame in frames if len(frame.encoding.regions)]
         if len(seen) == 1 and seen[0].search_result is not None:
@@ -134,7 +134,7 @@ class Searches:
             queries: of one question.
 
         Raises:
-            StorageFailure: the map's files cannot be read.
+            StorageFailure: the map cannot be read.
         """
         question = queries[0].question
         if question.selection is not None:

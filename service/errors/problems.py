@@ -141,6 +141,7 @@ KINDS: dict[type[Exception], Kind] = {
     # Storage
     errors.StorageFull: Kind(507, "storage-full", "The disk is full"),
     errors.StorageFailure: Kind(500, "storage-failure", "The disk failed"),
+    errors.TooManyOpenFiles: Kind(503, "too-many-open-files", "Too many files are open"),
     errors.StoreUnavailable: Kind(503, "store-unavailable", "The maps cannot be reached"),
     errors.StoreOfAnotherVersion: Kind(503, "store-of-another-version", "The maps were stored by another version"),
     errors.MapBusy: Kind(503, "map-busy", "What is to be erased is still being read"),
@@ -226,6 +227,7 @@ RETRY_LATER = (
     faults.MemoryFull,
     faults.DeadlineExceeded,
     faults.NotReady,
+    errors.TooManyOpenFiles,
     errors.StoreUnavailable,
     faults.KeysUnreadable,
     faults.JobQueueFull,

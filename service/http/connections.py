@@ -16,6 +16,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from service.http.bodies import UploadMemory
+from service.open_files import shares_of
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 
@@ -44,6 +45,7 @@ class Connections:
 
     def __init__(self, settings: Settings, memory: UploadMemory, metrics: Metrics) -> None:
         self.settings, self.memory = settings, memory
+        self._most = shares_of(settings).connections
         self.draining = False
         """Whether a connection is closed after its next answer."""
         self._open: dict[Connection, str] = {}
@@ -86,11 +88,10 @@ class Connections:
             None if the connection is served; "surplus" if it is to be refused with an answer; "flood" if it is to be
             closed without one.
         """
-        settings = self.settings
-        most = settings.max_connections_per_address
+        most = self.settings.max_connections_per_address
         if most and self._of_address[address] >= most and not self._make_room(address):
             return self._refuse(connection)
-        if len(self._open) >= settings.max_connections and not self._make_room(None):
+        if len(self._open) >= self._most and not self._make_room(None):
             return self._refuse(connection)
         self._open[connection] = address
         self._of_address[address] += 1

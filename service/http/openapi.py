@@ -55,6 +55,7 @@ COMMON_OF_MAPS: tuple[type[Exception], ...] = (
     errors.UnknownMap,
     errors.InvalidIdentifier,
     errors.StorageFailure,
+    errors.TooManyOpenFiles,
     errors.MapQuarantined,
 )
 """Problems of every operation on one map."""

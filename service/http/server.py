@@ -12,7 +12,6 @@ import functools
 import logging
 import math
 import os
-import resource
 import signal
 import socket
 import time
@@ -28,9 +27,6 @@ from service.http.connections import Connections
 from service.http.http_connection import HttpConnection
 from service.http.websocket_connection import WebSocketConnection
 from service.settings import Settings
-
-SPARE_FILES = 1024
-"""Open files besides the connections, most of them files of maps."""
 
 LAST_WORD_SECONDS = 1.0
 """How long a request that is cancelled has for its answer, which says so."""
@@ -89,7 +85,6 @@ def serve_application(
         message = f"Cannot listen on port {settings.port} of {settings.host}. Is another service running there?"
         raise CannotListen(message) from error
     detect_dead_peers(listener, settings)
-    raise_file_limit(settings.max_connections)
 
     async def run() -> None:
         async with lifespan():
@@ -162,15 +157,3 @@ def detect_dead_peers(listener: socket.socket, settings: Settings) -> None:
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, max(1, seconds))
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, max(1, seconds // 3))
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-
-
-def raise_file_limit(connections: int) -> None:
-    """Request as many open files from the system as the connections and the maps may need; warn if it refuses."""
-    wanted = connections + SPARE_FILES
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
-    if soft != resource.RLIM_INFINITY and soft < most:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-        soft = most
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        log.warning("the system allows %d open files; %d connections and the maps want %d", soft, connections, wanted)

@@ -320,7 +320,7 @@ def verify_map(
         bool, Query(description="Answer 202 with a job; its result is the report. A large map takes minutes.")
     ] = False,
 ) -> VerifyReport | Response:
-    """Read all files of a map, which may be damaged, and compare them with their checksums."""
+    """Read all of a map, which may be damaged, and compare it with its checksums."""
     if not background:
         return engine.maps.verify(map_id)
     job = jobs.submit(storage_jobs.VERIFY, map_id, arguments={}, maps=storage_jobs.creation_times(engine, map_id))

@@ -65,7 +65,6 @@ MAP_EXAMPLE: dict[str, Any] = {
         "tier": "exact",
         "wanted": "exact",
         "state": "ready",
-        "progress": 1.0,
         "rows_indexed": 0,
         "recall": None,
         "bytes_in_memory": 10902753,
@@ -123,7 +122,7 @@ class MapView(BaseModel):
         "places or of strangers, or on too few of them. Null: nothing is known against it."
     )
     index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
-    storage: StorageStatus = Field(description="The size of the map on disk.")
+    storage: StorageStatus = Field(description="The size of what is stored of the map.")
     places: int
     last_day: VerdictCounts | None = Field(
         description="Answers of the last 24 hours by their verdicts; null if the statistics cannot be read."

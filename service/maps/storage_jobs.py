@@ -1,4 +1,4 @@
-"""Jobs on what a map stores: one rebuilds its search index, one compares all of its files with their checksums."""
+"""Jobs on what a map stores: one rebuilds its search index, one compares all of it with its checksums."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ REBUILD, VERIFY = "rebuild", "verify"
 
 
 def rebuild(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Rebuild a map's search index; after a restart the job begins again, since a part of an index is never used.
+    """Rebuild a map's search index; after a restart the job begins again.
 
     Raises:
-        UnknownMap, MapQuarantined, StorageFailure: the map keeps the index that it had.
+        UnknownMap, MapQuarantined, StorageFull, StorageFailure: the codes that were stored until then stay.
         JobCancelled, JobInterrupted.
     """
     status = context.map(engine.maps).rebuild_index(_progress_callback(engine, context))
@@ -25,7 +25,7 @@ def rebuild(engine: Engine, context: JobContext) -> Mapping[str, Any]:
 
 
 def verify(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Read all files of a map, damaged or not, and compare them with their checksums; a restart begins again.
+    """Read all of a map, damaged or not, and compare it with its checksums; a restart begins again.
 
     Raises:
         UnknownMap, StorageFailure.

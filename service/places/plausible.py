@@ -103,7 +103,7 @@ def pose_remarks(map_: Map, sequences: Collection[str]) -> list[str]:
     """Remarks on the headings of some traverses that a map has now: what its pictures say against them.
 
     Raises:
-        StorageFailure: the map's files cannot be read.
+        StorageFailure: the map cannot be read.
     """
     found = pose_survey(map_).traverses.values()
     return [one.remark for one in found if one.remark is not None and one.sequence in sequences]

@@ -1,8 +1,8 @@
 """The job that erases frames: it deletes places and looks, and then all that has something of what they showed.
 
 It may be chosen by ids, by the conditions of a deletion, or by a robot's session, which is a run.  Frames stored for
-review, the latest answers and events go with the places that they are about; then the map overwrites what all of them
-have left.  A run of which frames were erased teaches its map nothing more.
+review, the latest answers and events go with the places that they are about; then the map is rewritten without
+what all of them have left.  A run of which frames were erased teaches its map nothing more.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class Rooms:
 
 
 def erase(rooms: Rooms, context: JobContext) -> Mapping[str, Any]:
-    """Delete places and all that has something of their frames, and overwrite what is left.
+    """Delete places and all that has something of their frames, and rewrite the map without what is left.
 
     The ids are noted before anything is deleted, so that an attempt after a restart ends what was begun.
 

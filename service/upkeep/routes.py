@@ -105,10 +105,10 @@ def reencode_map(
 
 @router.post("/rebuild", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
 def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
-    """Rebuild the search index of a map, its codes, from the checksummed descriptors.
+    """Rebuild the search index of a map, its codes, from the checksummed descriptors, and measure its recall.
 
-    Searches use the old index until the new one replaces it. This is useful if the index is in doubt. A map that is
-    searched exactly has no index to rebuild.
+    Searches go on meanwhile. This is useful if the index is in doubt. A map that is searched exactly has no recall to
+    measure.
     """
     return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.maps.get(map_id))
 
@@ -117,10 +117,10 @@ def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Respo
     "/erase", status_code=202, dependencies=[Depends(json_body)], responses=problem_documentation(*JOB_PROBLEMS)
 )
 def erase_frames(map_id: MapId, order: Erasing, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
-    """Erase frames for good: places, what was stored of them, and what they have left in files.
+    """Erase frames for good: places, what was stored of them, and what they have left.
 
-    The job deletes the places and looks, the frames for review and the latest answers that are about them, and
-    overwrites or removes their pictures, descriptors, keypoints and codes, so that no file of the map has them any
+    The job deletes the places and looks, the frames for review and the latest answers that are about them, with
+    their pictures, descriptors, keypoints and codes, and rewrites the map's file, so that it has no byte of them any
     more. It ends the session that is named, whose run teaches the map nothing. It waits for exports and checks that
     read the map; writes to the map wait for parts of it. An empty order erases what places that were deleted before
     have left. Bags that wait to be enrolled are named in the result, and removed if the order says so.

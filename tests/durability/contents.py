@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from typing import Any
 
 import numpy as np
 
+from core.ledger.maps.review import stored_frames
 from core.places import Neighborhood, place_and_look
 from core.store import Directory, Map
 from tests.durability.model import GONE
-
-SETTLING_SECONDS = 60.0
 
 
 def sha(data: bytes) -> str:
@@ -20,21 +18,23 @@ def sha(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def contents(atlas: Directory) -> dict[str, Any]:
+def contents(directory: Directory) -> dict[str, Any]:
     """All maps, unlisted ones too, read whole, verified and searched.
 
     Raises:
-        AssertionError: a map is quarantined, damaged, not searched as it is stored, or its index does not get ready.
+        AssertionError: a map is quarantined, damaged, or not searched as it is stored.
     """
-    assert atlas.quarantined() == {}, atlas.quarantined()
-    listed = [record.id for record in atlas.records(None, 1000)[0]]
-    found = {name: map_contents(atlas.get(name), True) for name in listed}
-    return found | {name: map_contents(map_, False) for name, map_ in atlas.unlisted().items()}
+    assert directory.quarantined() == {}, directory.quarantined()
+    listed = [record.id for record in directory.records(None, 1000)[0]]
+    found = {name: map_contents(directory.get(name), True) for name in listed}
+    return found | {name: map_contents(map_, False) for name, map_ in directory.unlisted().items()}
 
 
 def map_contents(map_: Map, listed: bool) -> dict[str, Any]:
     """One map."""
-    _wait_for_index(map_)
+    map_.open()
+    status = map_.index_status()
+    assert (status.state, status.tier) == ("ready", status.wanted), status
     record = map_.record.model_dump(mode="json")
     settings = map_.record.settings().model_dump(mode="json")
     report = map_.verify()
@@ -48,17 +48,19 @@ def map_contents(map_: Map, listed: bool) -> dict[str, Any]:
         **{name: record[name] for name in ("precision", "revision", "created_at", "updated_at", "calibration")},
         "cameras": {one.name: one.mask and one.mask.model_dump(mode="json") for one in map_.cameras.all()},
         "ends": ends,
+        "review": _review(map_),
         "places": _places(map_),
     }
 
 
-def _wait_for_index(map_: Map) -> None:
-    map_.open()
-    until = time.monotonic() + SETTLING_SECONDS
-    while (status := map_.index_status()).state == "building":
-        assert time.monotonic() < until, status
-        time.sleep(0.002)
-    assert status.tier == status.wanted, status
+def _review(map_: Map) -> list[Any]:
+    """The frames that are stored for review, the newest first, with their pictures."""
+    found = []
+    for frame in stored_frames(map_.review):
+        picture = map_.review.picture(frame.number)
+        assert (sha(picture), len(picture)) == (frame.digest.hex(), frame.size)
+        found.append([frame.digest.hex(), dict(frame.answer), None if frame.label is None else dict(frame.label)])
+    return found
 
 
 def _places(map_: Map) -> list[dict[str, Any]]:

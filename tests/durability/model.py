@@ -142,6 +142,10 @@ def merged(target: Any, patch: Any) -> Any:
 class MapModel:
     """One map.  ``ends`` are the ordinals that come next in each sequence.
 
+    review: the frames that are stored for review, the newest first: digest, answer and label of each.
+    showed: the digests of all frames that were ever stored.
+    erased: those of which the file has nothing any more, unless they are stored again.
+
     Frames of one picture show one view, unless poses put them apart; those of different pictures do not.
     """
 
@@ -157,6 +161,9 @@ class MapModel:
     cameras: dict[str, Any] = field(default_factory=dict)
     pictures: int = 0
     numbers: int = 0
+    review: list[list[Any]] = field(default_factory=list)
+    showed: set[str] = field(default_factory=set)
+    erased: set[str] = field(default_factory=set)
 
     # Writes; each returns the answer that it must get
 
@@ -180,6 +187,7 @@ class MapModel:
         if known is not None and known.shown.digest == shown.digest:
             known.keypoints = keypoints if known.keypoints is None else known.keypoints
             return self.set_fields(place_id, fields)
+        self._shows(shown.digest)
         kept = self.settings["keep"] if keep is None else keep
         if known is None:
             sequence = fields.get("sequence")
@@ -221,6 +229,7 @@ class MapModel:
             return "unchanged"
         if place.shown.digest == shown.digest:
             raise Refused("RepeatedLook")
+        self._shows(shown.digest)
         self.numbers += 1
         stored = shown.descriptor.get(self.precision, ANY)
         place.looks[name] = LookModel(
@@ -314,6 +323,41 @@ class MapModel:
         for place_id in gone:
             self.forget(place_id)
         return len(gone)
+
+    def keep_for_review(self, digest: str, answer: dict[str, Any], most: int) -> bool:
+        """Store a frame for review, and drop those beyond so many; False if it is there already."""
+        if any(frame[0] == digest for frame in self.review):
+            return False
+        self._shows(digest)
+        self.review.insert(0, [digest, answer, None])
+        while len(self.review) > most:
+            going = [frame for frame in self.review if frame[2] is None] or self.review
+            self.review.remove(going[-1])
+        return True
+
+    def erase(self) -> None:
+        """Leave nothing in the file of frames that are not there any more."""
+        self.erased = self.showed - self.frames
+
+    def imported(self) -> MapModel:
+        """The map that is made of this one's export file."""
+        made = copy.deepcopy(self)
+        for number, place in enumerate(made.places.values()):
+            place.picture = number  # an archive does not say which places got another picture
+        made.review = [frame for frame in made.review if frame[2] is not None]
+        made.showed, made.erased = made.frames, set()
+        return made
+
+    @property
+    def frames(self) -> set[str]:
+        """The digests of the frames that its places show, and of those that are stored for review."""
+        places = self.places.values()
+        looks = {look.shown.digest for place in places for look in place.looks.values()}
+        return {place.shown.digest for place in places} | looks | {frame[0] for frame in self.review}
+
+    def _shows(self, digest: str) -> None:
+        self.showed.add(digest)
+        self.erased.discard(digest)
 
     def edit(self, changes: dict[str, Any]) -> int:
         """Change settings; the new revision."""
@@ -411,6 +455,7 @@ class MapModel:
             "calibration": self.calibration,
             "cameras": self.cameras,
             "ends": sorted(([name, end] for name, end in self.ends.items()), key=str),
+            "review": self.review,
             "places": [self._expected_place(place_id, place) for place_id, place in self.places.items()],
         }
 
@@ -535,6 +580,8 @@ class Lost(AssertionError):
 def settled(candidates: Sequence[World], found: Mapping[str, Mapping[str, Any]]) -> tuple[World, int]:
     """The world among the candidates that was found, with what was unknown filled in, and its index.
 
+    What an operation began to store may be in the file though it was not found.
+
     Raises:
         Lost: none of them was found.
     """
@@ -545,6 +592,9 @@ def settled(candidates: Sequence[World], found: Mapping[str, Mapping[str, Any]])
             world = copy.deepcopy(world)
             for name, one in world.items():
                 one.learn(found[name])
+                for other in candidates:
+                    if name in other:
+                        one.erased &= other[name].erased
             return world, number
         told.append(f"not as {'before' if number == 0 else 'after'} the last operation:\n  " + "\n  ".join(wrong[:12]))
     raise Lost("\n".join(told))

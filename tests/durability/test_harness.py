@@ -11,6 +11,8 @@ from random import Random
 import pytest
 
 from tests.durability.model import ANY, Lost, MapModel, Shown, World, settled
+from tests.durability.storage.kills import expect_erased
+from tests.durability.storage.operations import shown, traces_of
 from tests.durability.traced_disk import CERTAIN, Disk, Variant, arguments
 from tests.syscalls import strace
 
@@ -25,7 +27,7 @@ def world() -> World:
     return {"lab": lab}
 
 
-@pytest.mark.parametrize("part", ["places", "ends", "cameras", "revision"])
+@pytest.mark.parametrize("part", ["places", "ends", "cameras", "review", "revision"])
 def test_any_difference_is_a_loss(part: str) -> None:
     before = world()
     after = copy.deepcopy(before)
@@ -33,7 +35,12 @@ def test_any_difference_is_a_loss(part: str) -> None:
     found = {"lab": copy.deepcopy(before["lab"].expected())}
     assert settled([before, after], found)[1] == 0
     assert settled([before, after], {"lab": after["lab"].expected()})[1] == 1
-    found["lab"][part] = {"places": found["lab"]["places"][:1], "ends": [], "cameras": {"front": None}}.get(part, 7)
+    found["lab"][part] = {
+        "places": found["lab"]["places"][:1],
+        "ends": [],
+        "cameras": {"front": None},
+        "review": [["digest"]],
+    }.get(part, 7)
     with pytest.raises(Lost, match=part):
         settled([before, after], found)
     with pytest.raises(Lost):
@@ -59,6 +66,25 @@ def test_what_was_never_acknowledged_is_learnt_once() -> None:
     found["lab"]["places"][0]["created_at"] = "another time"
     with pytest.raises(Lost, match="created_at"):
         settled([learnt], found)
+
+
+def test_what_was_erased_is_found_in_any_file(tmp_path: Path) -> None:
+    lab = MapModel({"keep": "image"})
+    for number in range(3):
+        lab.enrol("a", shown(f"picture {number}"), {})
+    lab.erase()
+    assert lab.erased == {shown(f"picture {number}").digest for number in (0, 1)}
+    folder = tmp_path / "maps/lab"
+    folder.mkdir(parents=True)
+    (folder / "map.sqlite").write_bytes(b"".join(traces_of("picture 2")))
+    expect_erased(tmp_path, {"lab": lab})
+    for trace in traces_of("picture 1"):
+        (folder / "map.sqlite-wal").write_bytes(b"before" + trace + b"behind")
+        with pytest.raises(Lost, match="something of picture 1, which was erased"):
+            expect_erased(tmp_path, {"lab": lab})
+    after = copy.deepcopy(lab)
+    after.enrol("b", shown("picture 1"), {})
+    expect_erased(tmp_path, {"lab": lab}, {"lab": after})  # it may have been begun
 
 
 SCRIPT = """

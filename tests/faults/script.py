@@ -16,12 +16,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from core.storage.search import index_files
+
 from core.errors import PlacerecError
 from core.frames.masks import Mask
 from core.maps import Correspondence, MapSettings
 from core.places import PlaceFields
 from core.store import Directory, Map
-from core.storage.search import index_files
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
 from tests.faults.model import State, all_told, best_of, place
 

@@ -15,8 +15,8 @@ import tempfile
 from pathlib import Path
 
 import faiss
-
 from core.storage.search import snapshot
+
 from tests.faults import script
 
 _SET_TRACER, _ANY = 0x59616D61, ctypes.c_ulong(-1)

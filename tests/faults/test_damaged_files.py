@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from core.storage.search import index_files
 from numpy.typing import NDArray
 
 from core.errors import MapQuarantined, StorageFailure
 from core.maps import MapSettings, PlaceFilter
 from core.store import Directory, Map
-from core.storage.search import index_files
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.faults.damage import DAMAGES, Damage, flip, flip_anywhere, flip_used
 from tests.faults.model import State, told

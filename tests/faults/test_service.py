@@ -179,7 +179,8 @@ def test_no_file_descriptor_is_left(server: Server, lab: str) -> None:
     process, (soft, hard) = server.process.pid, resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE)
     resource.prlimit(process, resource.RLIMIT_NOFILE, (min(open_files(server), soft), hard))
     try:
-        check_refused(server, 500, "storage-failure")
+        check_refused(server, 503, "too-many-open-files")
+        assert 1 <= int(server.enrol("lab", "refused", jpeg(7)).headers["Retry-After"]) <= 3
     finally:
         resource.prlimit(process, resource.RLIMIT_NOFILE, (soft, hard))
     check_recovered(server)

@@ -29,7 +29,7 @@ from service.queries.counts import Statistics
 from service.queries.statistics import QueryStatistics
 from service.sessions.table import SessionRecord, SessionTable, session_file
 from service.telemetry.history import LoadHistory
-from tests.core.storage.archives.files import exported
+from tests.core.store.archives.files import exported
 from tests.faults.damage import DAMAGES
 from tests.faults.test_damaged_files import make_map
 

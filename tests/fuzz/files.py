@@ -41,8 +41,8 @@ from lab.conversion.onnx_import import import_onnx
 from service.errors.faults import Fault
 from service.http.multipart import FormReader
 from tests.core.recordings.bags import WRITERS, walk
-from tests.core.storage.archives.conftest import filled
-from tests.core.storage.archives.files import changed, exported, imported
+from tests.core.store.archives.conftest import filled
+from tests.core.store.archives.files import changed, exported, imported
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 from tests.lab.conversion.hostile import damaged
 from tests.lab.conversion.onnx_writer import MAPS

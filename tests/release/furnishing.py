@@ -191,9 +191,9 @@ def pack(data: Path, target: Path) -> None:
         archive.add(data, "data", filter=anonymous)
 
 
-def write(version: str) -> Path:
+def write(version: str, fixtures: Path = FIXTURES) -> Path:
     """Write the fixtures of a version anew; their folder."""
-    release = FIXTURES / version
+    release = fixtures / version
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         data, made = folder / "data", folder / "made"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -64,10 +65,13 @@ class ForkedServer:
         environment: all its variables.
         log: the file that its output is appended to.
         traced: it waits until it is traced.
+        files: the soft and the hard limit of its open files; None: those of this process.
     """
 
-    def __init__(self, environment: Mapping[str, str], log: Path, traced: bool = False) -> None:
-        self._process = _Process(target=_serve, args=(dict(environment), log, traced), daemon=True)
+    def __init__(
+        self, environment: Mapping[str, str], log: Path, traced: bool = False, files: tuple[int, int] | None = None
+    ) -> None:
+        self._process = _Process(target=_serve, args=(dict(environment), log, traced, files), daemon=True)
         self._process.start()
         assert self._process.pid is not None
         self.pid = self._process.pid
@@ -94,7 +98,9 @@ class ForkedServer:
         self.send_signal(signal.SIGKILL)
 
 
-def _serve(environment: Mapping[str, str], log: Path, traced: bool) -> None:
+def _serve(environment: Mapping[str, str], log: Path, traced: bool, files: tuple[int, int] | None) -> None:
+    if files is not None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, files)
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (1, 2):
         os.dup2(output, stream)

@@ -59,6 +59,7 @@ class Server:
         forked: start it off a process that has imported everything; not if it has a wrapper, or has to be where this
             process is, as in a network of its own.
         reservation: of the port that it listens on; it is closed when the server ends. A free port if left out.
+        files: the soft and the hard limit of its open files, if it is forked; None: those of this process.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class Server:
         key: str | None = None,
         forked: bool = True,
         reservation: socket.socket | None = None,
+        files: tuple[int, int] | None = None,
     ) -> None:
         self.reservation = reservation or reserved()
         self.folder, self.port, self.key = folder, int(self.reservation.getsockname()[1]), key
@@ -85,7 +87,7 @@ class Server:
             with self.log_file.open("ab") as log:
                 self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
         else:
-            self.process = ForkedServer(environment, self.log_file)
+            self.process = ForkedServer(environment, self.log_file, files=files)
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=60, headers=headers)
 

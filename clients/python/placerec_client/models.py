@@ -1113,12 +1113,10 @@ class IndexStatus(Model):
     setting: Known[Literal["auto", "exact", "compact"]]
     tier: Known[Literal["exact", "compact"]]
     wanted: Known[Literal["exact", "compact"]]
-    state: Known[Literal["ready", "building", "unopened"]]
-    progress: float
+    state: Known[Literal["ready", "unopened"]]
     rows_indexed: int
     recall: Recall | None = None
     bytes_in_memory: int
-    problem: str | None = None
 
 
 class Progress(Model):
@@ -1455,14 +1453,14 @@ class ReviewSetting(Model):
 
 
 class StorageStatus(Model):
-    """The size of a map on disk."""
+    """The size of what is stored of a map."""
 
     precision: str
     bytes_per_place: int
     descriptors: int
     index: int
     database: int
-    keypoints: KeypointsStatus | None = None
+    keypoints: KeypointsStatus
 
 
 class VerdictCounts(Model):
@@ -1531,6 +1529,15 @@ class MemoryState(Model):
     resident: int | None = None
     uploads: int
     upload_limit: int
+
+
+class OpenState(Model):
+    """What is open, and how much may be."""
+
+    maps: int
+    most_maps: int
+    files: int | None = None
+    most_files: int
 
 
 class OperationState(Model):
@@ -1657,6 +1664,7 @@ class Readiness(Model):
     checks: dict[str, str]
     encoder: str
     quarantined: list[QuarantinedMap]
+    open: OpenState
 
 
 class RecentAnswerView(Model):

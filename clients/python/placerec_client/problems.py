@@ -517,6 +517,10 @@ class TooManyListeners(Problem):
     """503 ``too-many-listeners``: Too many clients listen to events."""
 
 
+class TooManyOpenFiles(Problem):
+    """503 ``too-many-open-files``: Too many files are open."""
+
+
 class TooManyWatchers(Problem):
     """503 ``too-many-watchers``: Too many clients follow jobs."""
 
@@ -657,6 +661,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "too-many-exports": TooManyExports,
     "too-many-imports": TooManyImports,
     "too-many-listeners": TooManyListeners,
+    "too-many-open-files": TooManyOpenFiles,
     "too-many-watchers": TooManyWatchers,
     "wrong-vocabulary": WrongVocabulary,
     "storage-full": StorageFull,

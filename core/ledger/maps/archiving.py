@@ -109,6 +109,8 @@ class _Source:
         for some in pieces(group):
             numbers = [place.row for place in some]
             descriptors, local = (rows.at(self.connection, kind, numbers) for kind in rows.OF_FRAMES)
+            if any(row not in descriptors or row not in local for row in numbers):
+                raise DamagedRow("a place has no descriptors")
             yield b"".join(part for row in numbers for part in (descriptors[row], local[row]))
             self.expect_there()
 

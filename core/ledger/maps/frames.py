@@ -65,16 +65,6 @@ _DELETE_PICTURES = Statement(delete(PICTURES).where(_PICTURE.map == bindparam("m
 _DELETE_KEYPOINTS = Statement(delete(KEYPOINTS).where(_K.map == bindparam("map"), among(_K.row, "rows")))
 
 
-_PAGE_OF_KEYPOINTS = Statement(
-    select(_P.row, _P.id, _P.digest, _K.checksum, _K.record)
-    .select_from(_OF_PLACES)
-    .where(_P.map == bindparam("map"), _P.row > bindparam("after"))
-    .order_by(_P.row)
-    .limit(bindparam("most"))
-)
-_AT_ONCE = 100
-
-
 def checksum_of(record: bytes, digest: bytes) -> int:
     """The checksum of a record of the keypoints of the frame with this digest."""
     return zlib.crc32(record, zlib.crc32(digest))
@@ -127,15 +117,6 @@ def sizes_at(connection: MapConnection, rows: Sequence[int]) -> tuple[dict[int, 
 def damaged_keypoints_at(connection: MapConnection, rows: Sequence[int]) -> set[int]:
     """Those of some rows whose keypoints do not match their checksum."""
     return {row for row, _, *stored in connection.execute(_KEYPOINTS_AT, rows=list(rows)) if not _is_sound(*stored)}
-
-
-def damaged_keypoints(connection: MapConnection) -> list[str]:
-    """The ids of the places whose keypoints do not match their checksum."""
-    damaged, after = [], -1
-    while page := connection.execute(_PAGE_OF_KEYPOINTS, after=after, most=_AT_ONCE):
-        damaged += [str(place) for _, place, *stored in page if not _is_sound(*stored)]
-        after = page[-1][0]
-    return damaged
 
 
 def _is_sound(digest: bytes, checksum: int, record: bytes) -> bool:

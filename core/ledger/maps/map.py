@@ -227,9 +227,12 @@ class LedgerMap(ABC):
             if stored is None:
                 return None, None
             try:
-                return stored.place, frames.pictures_at(connection, [stored.row]).get(stored.row)
+                picture = frames.pictures_at(connection, [stored.row]).get(stored.row)
             except StorageFailure as damage:
                 raise StorageFailure(f"The stored picture of {_named(place_id)} is damaged.") from damage
+            if picture is None and stored.place.picture != "none":
+                raise StorageFailure(f"The stored picture of {_named(place_id)} is missing.")
+            return stored.place, picture
 
     # Writing
 

@@ -177,9 +177,12 @@ def state_of(connection: MapConnection, map_id: str, locked: bool = False) -> Ma
 
     Raises:
         UnknownMap: it is gone.
-        DamagedRow: its row does not match its checksum, or is invalid.
+        DamagedRow: its row does not match its checksum, or is invalid, or is missing in a file, which has one map.
     """
-    return _expect(connection.execute(_OF_NUMBER_LOCKED if locked else _OF_NUMBER), map_id)
+    found = connection.execute(_OF_NUMBER_LOCKED if locked else _OF_NUMBER)
+    if not found and connection.whole.dialect == "sqlite":
+        raise DamagedRow("the map's own record is missing")
+    return _expect(found, map_id)
 
 
 def _expect(found: list[tuple[Any, ...]], map_id: str) -> MapState:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -27,8 +26,6 @@ from core.ledger.statements import Statement, among
 from core.maps.records import ReviewSetting
 from core.maps.review import ReviewFrame, StoredReviews, frames_to_drop
 from core.maps.stored_fields import moment_text
-
-log = logging.getLogger(__name__)
 
 _F, _P = FRAMES.c, PICTURES.c
 _COLUMNS = sealed_columns(FRAMES)
@@ -189,7 +186,7 @@ class Review:
             return len(going)
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> StoredReviews:
-        """The latest frames, newest first, and how many are stored in all, as of one moment.
+        """The latest frames, newest first, and how many are stored in all, as of one moment; without damaged ones.
 
         Args:
             before: only frames with a smaller number; None: all.
@@ -197,18 +194,19 @@ class Review:
         """
         with self._reading() as connection:
             found = connection.execute(_PAGES[labelled], before=2**62 if before is None else before, most=limit)
-            return StoredReviews(_sound(found), *_size(connection))
+            return StoredReviews(_frames(found), *_size(connection))
 
     def labelled(self) -> list[ReviewFrame]:
-        """All frames with a label, oldest first."""
+        """All frames with a label, oldest first; without damaged ones."""
         with self._reading() as connection:
-            return _sound(connection.execute(_LABELLED))
+            return _frames(connection.execute(_LABELLED))
 
     def find(self, number: int) -> ReviewFrame:
         """One frame.
 
         Raises:
             UnknownFrame: it is not stored.
+            StorageFailure: it is damaged.
         """
         with self._reading() as connection:
             return _frame(_expect(connection, number))
@@ -222,9 +220,9 @@ class Review:
         """
         with self._reading() as connection:
             frame, stored = _frame(_expect(connection, number)), connection.one(_PICTURE, number=number)
-        if stored is None or not isinstance(stored[0], bytes) or hashlib.sha256(stored[0]).digest() != frame.digest:
+        if stored is None or hashlib.sha256(stored[0]).digest() != frame.digest:
             raise StorageFailure(f"The picture of the frame {number} is damaged; discard the frame.")
-        return stored[0]
+        return bytes(stored[0])
 
     @contextmanager
     def held(self, number: int) -> Iterator[None]:
@@ -304,8 +302,7 @@ def _labelled(
 
 def _renewed(connection: MapConnection, known: tuple[Any, ...], answer: Mapping[str, Any]) -> bool:
     """Give a stored frame another answer, unless it has a label; whether it got it."""
-    *columns, _ = known
-    before = dict(zip(_COLUMNS, columns, strict=True))
+    before = dict(zip(_COLUMNS, _checked(known)[:-1], strict=True))
     changed = sealed(_COLUMNS, {**before, "answer": json.dumps(answer)})
     values = {"which": before["number"], "new_answer": changed["answer"], "new_seal": changed["seal"]}
     return before["label"] is None and bool(connection.change(_RENEW, **values))
@@ -338,21 +335,22 @@ def _expect(connection: MapConnection, number: int) -> tuple[Any, ...]:
     values = connection.one(_FIND, number=number)
     if values is None:
         raise _unknown(number)
-    if not is_sound(values[:-1], values[-1]):
-        raise StorageFailure(f"The frame {number} is damaged; discard it.")
+    return _checked(values)
+
+
+def _checked(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    *columns, seal = values
+    if not is_sound(columns, seal):
+        raise StorageFailure(f"The frame {columns[0]} is damaged; discard the frame.")
     return values
+
+
+def _frames(found: list[tuple[Any, ...]]) -> list[ReviewFrame]:
+    return [_frame(values) for values in found if is_sound(values[:-1], values[-1])]
 
 
 def _unknown(number: int) -> UnknownFrame:
     return UnknownFrame(f"The map keeps no frame {number} for review.")
-
-
-def _sound(found: Sequence[tuple[Any, ...]]) -> list[ReviewFrame]:
-    """Frames whose rows match their checksums; others, which harm nothing else, are left out."""
-    sound = [_frame(values) for values in found if is_sound(values[:-1], values[-1])]
-    if len(sound) < len(found):
-        log.error("%d frames that are stored for review do not match their checksums", len(found) - len(sound))
-    return sound
 
 
 def _frame(values: tuple[Any, ...]) -> ReviewFrame:

@@ -77,6 +77,8 @@ _UNCODED = Statement(
     )
     .order_by(DESCRIPTORS.c.row)
 )
+_HAS_PLACE = exists().where(PLACES.c.map == _R.map, PLACES.c.row == _R.number)  # whose number was damaged
+_OF_PLACES = Statement(select(_R.number).where(_of_map(DEAD_ROWS), _HAS_PLACE))
 _LEAVE = Statement(
     lambda insert: (
         insert(DEAD_ROWS)
@@ -87,12 +89,17 @@ _LEAVE = Statement(
 _DEAD_SINCE = Statement(select(_R.number).where(_of_map(DEAD_ROWS), _R.revision > bindparam("after")))
 _OLD = Statement(
     select(_R.number)
-    .where(_of_map(DEAD_ROWS), _R.cleared == 0, _R.since < seconds_now() - bindparam("age"))
+    .where(
+        _of_map(DEAD_ROWS),
+        _R.cleared == 0,
+        _R.since < seconds_now() - bindparam("age"),
+        ~_HAS_PLACE,
+    )
     .order_by(_R.since)
     .limit(bindparam("most"))
     .with_for_update(skip_locked=True)
 )
-_UNCLEARED = Statement(select(func.count()).where(_of_map(DEAD_ROWS), _R.cleared == 0))
+_UNCLEARED = Statement(select(func.count()).where(_of_map(DEAD_ROWS), _R.cleared == 0, ~_HAS_PLACE))
 _CLEAR = Statement(update(DEAD_ROWS).where(_of_map(DEAD_ROWS), among(_R.number, "rows")).values(cleared=1))
 _FORGET = Statement(
     delete(DEAD_ROWS).where(_of_map(DEAD_ROWS), _R.cleared == 1, _R.since < seconds_now() - bindparam("age"))
@@ -172,6 +179,11 @@ def of_no_place(connection: MapConnection) -> list[int]:
 
 
 # Rows that no place has any more
+
+
+def dead_of_places(connection: MapConnection) -> list[int]:
+    """Rows that are noted as dead though a place has them."""
+    return [row for (row,) in connection.execute(_OF_PLACES)]
 
 
 def leave(connection: MapConnection, row: int, revision: int) -> None:

@@ -72,10 +72,12 @@ MAPS = Table(
     sqlite_strict=True,
 )
 
-# The code of the places without a sequence is NO_SEQUENCE, and their sequence has no name.
+# The code of the places without a sequence is NO_SEQUENCE, and their sequence has no name.  The negative of the next
+# ordinal is there as its checksum, which a statement can compute.
 SEQUENCES = _table(
     "sequences", ("code",), _column("code", integer()), _column("name", text(), optional=True),
-    _column("next_ordinal", integer(), server_default="0"), Unique("map", "name"), clustered=True,
+    _column("next_ordinal", integer(), server_default="0"), _column("negative", integer(), server_default="0"),
+    Unique("map", "name"), CheckConstraint("next_ordinal + negative = 0"), clustered=True,
 )  # fmt: skip
 
 # Track and station are the sequence and the ordinal at which another traverse shows what this place shows

@@ -29,13 +29,12 @@ _NEW_CODE = Statement(
 _NEXT = Statement(
     update(SEQUENCES)
     .where(_OF_MAP, _S.code == bindparam("which"))
-    .values(next_ordinal=_S.next_ordinal + 1)
+    .values(next_ordinal=_S.next_ordinal + 1, negative=-1 - _S.next_ordinal)
     .returning(_S.next_ordinal - 1)
 )
+_FREE = greatest(_S.next_ordinal, bindparam("least"))
 _KEEP_FREE = Statement(
-    update(SEQUENCES)
-    .where(_OF_MAP, _S.code == bindparam("which"))
-    .values(next_ordinal=greatest(_S.next_ordinal, bindparam("least")))
+    update(SEQUENCES).where(_OF_MAP, _S.code == bindparam("which")).values(next_ordinal=_FREE, negative=-_FREE)
 )
 _DROP = Statement(
     delete(SEQUENCES).where(

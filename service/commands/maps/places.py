@@ -26,9 +26,7 @@ from service.commands.jobs import followed, submit
 
 places = typer.Typer(cls=Commands, help="List, show, edit and delete the places of a map.", no_args_is_help=True)
 
-Erase = Annotated[
-    bool, typer.Option("--erase", help="Also overwrite what they leave in files, and discard frames for review.")
-]
+Erase = Annotated[bool, typer.Option("--erase", help="Also erase what is left of them, and discard frames for review.")]
 PlaceId = Annotated[str, typer.Argument(metavar="PLACE", help="The place's id.", show_default=False)]
 CLEARED = ("pose", "pose_accuracy", "timestamp", "sequence", "level", "metadata")
 COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
@@ -175,7 +173,7 @@ def show_erased(job: dict[str, Any], ordered: bool = True) -> None:
     found = job["result"]
     remark(
         f"Erased: {found['places']} places, {found['looks']} looks, {found['review']} frames for review, "
-        f"{found['answers']} answers; {found['rows']} descriptors are overwritten or removed."
+        f"{found['answers']} answers; what {found['rows']} frames had left is gone."
         + (f" Bags removed: {found['bags']}." if found["bags"] else "")
     )
     if ordered and not any(found[kind] for kind in ("places", "looks", "review", "answers", "bags")):

@@ -103,9 +103,9 @@ def write_map(
     Raises:
         StorageFailure: the directory cannot be written.
     """
-    atlas = Directory(data_dir)
+    maps = Directory(data_dir)
     settings = MapSettings(keep="none")
-    made = atlas.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape, precision=precision)
+    made = maps.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape, precision=precision)
     batch: list[Enrolment] = []
     for index, (descriptor, local) in enumerate(described):
         batch.append(_enrolment(index, descriptor, local, fields(index)))
@@ -114,7 +114,7 @@ def write_map(
             batch = []
     if batch:
         made.enrol(batch)
-    atlas.close()
+    maps.close()
 
 
 def _enrolment(index: int, descriptor: NDArray[np.float32], local: NDArray[np.int8], fields: PlaceFields) -> Enrolment:

@@ -100,9 +100,9 @@ def search_run(encoder: Encoder, places: int) -> Iterator[Callable[[], object]]:
     query = Query(encoder.encode(sample_frame(0)), Question(MATCHES))
     with tempfile.TemporaryDirectory() as folder:
         fill_map(Path(folder), "sample", encoder, places)
-        atlas = Directory(Path(folder))
+        maps = Directory(Path(folder))
         try:
-            map_ = atlas.get("sample")
+            map_ = maps.get("sample")
             yield lambda: locate(map_, encoder, [query])
         finally:
-            atlas.close()
+            maps.close()

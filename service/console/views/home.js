@@ -60,9 +60,6 @@ async function readMaps(signal) {
 function troubles(maps, service) {
   const found = [];
   for (const { id, reason } of maps?.quarantined || []) found.push({ tone: "bad", text: `${id} is damaged and out of service`, why: reason, address: href("maps") });
-  for (const { id, index } of maps?.items || []) {
-    if (index.problem) found.push({ tone: "bad", text: `The index of ${id} failed`, why: index.problem, address: href("maps") });
-  }
   for (const [name, told] of Object.entries(service?.checks || {})) {
     if (told !== "ok" && told !== service.degraded) found.push({ tone: "bad", text: `${name}: ${told}`, address: href("service") });
   }

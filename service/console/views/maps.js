@@ -89,7 +89,7 @@ function Row({ map, open, close, changed }) {
       <td class="number" title=${`${integer(map.storage.bytes_per_place)} bytes a place`}>${bytes(descriptors + index + database)}</td>
       <td class="nowrap">
         <span title=${map.encoder}>${encoderName(map.encoder)}</span>
-        <div class="faint small">${map.storage.precision}, ${map.index.tier}${map.index.state === "building" && ` ${Math.round(100 * map.index.progress)} %`}</div>
+        <div class="faint small">${map.storage.precision}, ${map.index.tier}</div>
       </td>
       <td class="number">${map.revision}</td>
       <td class="nowrap"><${Moment} at=${map.updated_at} /></td>
@@ -108,10 +108,8 @@ function Row({ map, open, close, changed }) {
 
 /** The health of a map in a word, and why. */
 function health(map) {
-  if (map.index.problem) return { word: "index failed", tone: "bad", why: map.index.problem };
   if (map.calibration === null) return { word: "no encoder", tone: "bad", why: "Its encoder is not installed." };
   if (map.places === 0) return { word: "empty", tone: "", why: "It has no places." };
-  if (map.index.state === "building") return { word: "indexing", tone: "on", why: "Its index is being built; it answers meanwhile." };
   const day = map.last_day;
   const total = day ? day.recognized + day.ambiguous + day.unknown : 0;
   if (total >= 20 && day.unknown / total > 0.5) {

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import resource
 import sqlite3
 import stat
 from pathlib import Path
@@ -10,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from core.disk.files import TEMPORARY, Damage, FolderLock, disk_errors, write_at, write_file
-from core.errors import DataDirectoryLocked, StorageFailure, StorageFull, UnknownPlace
+from core.disk.sqlite_file import connect
+from core.errors import DataDirectoryLocked, StorageFailure, StorageFull, TooManyOpenFiles, UnknownPlace
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
@@ -23,6 +25,25 @@ def test_a_full_disk_has_its_own_error(code: int) -> None:
 def test_other_refusals_are_failures(code: int) -> None:
     with pytest.raises(StorageFailure, match=os.strerror(code)), disk_errors("enrol"):
         raise OSError(code, os.strerror(code))
+
+
+def test_that_no_descriptor_is_left_is_no_fault_of_the_disk(tmp_path: Path) -> None:
+    path = tmp_path / "db"
+    connect(path, "rwc").close()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    next_one = os.open(os.devnull, os.O_RDONLY)
+    os.close(next_one)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (next_one, hard))
+    try:
+        with pytest.raises(TooManyOpenFiles, match="could not enrol"), disk_errors("enrol"):
+            path.read_bytes()
+        with pytest.raises(TooManyOpenFiles, match="could not enrol"), disk_errors("enrol"):
+            connect(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    with pytest.raises(StorageFailure, match="unable to open") as raised, disk_errors("enrol"):
+        connect(tmp_path / "missing")
+    assert not isinstance(raised.value, TooManyOpenFiles)
 
 
 def test_a_full_database_is_a_full_disk() -> None:

@@ -15,12 +15,11 @@ from core.judgement.trials import StagedTrials
 from core.learning import PlacedFrame, RunFrame, lesson_of, placed_frames, trials_of
 from core.learning.known_frames import MOST_ASKED, STRANGERS
 from core.maps import Enrolment, MapSettings
-from core.store import Map
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.method.regions import Regions
 from core.places import PlaceFields, Pose
-from core.store import Directory
+from core.store import Directory, Map
 from tests.core.learning.runs import covered, except_at, missed, recognized, walked, way
 from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 

@@ -1,4 +1,4 @@
-"""What every store of maps has to do (:mod:`core.maps.store`): random writes and queries, with a model beside them.
+"""What every store of maps has to do (:class:`core.store.Store`): random writes and queries, with a model beside them.
 
 A suite of one store derives a class from :class:`StoreContract` that says how the store is opened.
 """
@@ -13,6 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from core import errors
 from core.frames.masks import Mask, with_range
 from core.judgement.priors import Disc, Period
+from core.ledger.maps import rows
 from core.maps import Correspondence, History, PlaceFilter, ReviewSetting, SameFrame, Selection
 from core.maps.archives.reading import Archive, check
 from core.maps.records import Outline
@@ -267,6 +269,18 @@ class StoreContract(RuleBasedStateMachine):
 
         self.agree(edited, lambda lab: lab.edit({"description": text}, expected).revision)
 
+    @rule(setting=st.sampled_from(["auto", "exact", "compact"]))
+    def search_otherwise(self, setting: str) -> None:
+        self.agree(lambda model: model.edit({"index": setting}), lambda lab: lab.edit({"index": setting}).revision)
+
+    @rule()
+    def erase(self) -> None:
+        """What is deleted leaves no row."""
+        with patch.object(rows, "LEFT_SECONDS", -1):
+            self.map.erase()
+        with self.map.viewing() as (connection, _):
+            assert rows.uncleared(connection) == 0 and rows.of_no_place(connection) == []
+
     @rule(place_id=ids, picture=pictures, given=fields, ordinal=st.none() | st.integers(0, 9))
     def adopt(self, place_id: str, picture: str, given: dict[str, Any], ordinal: int | None) -> None:
         """A place of another map keeps its history."""
@@ -387,9 +401,11 @@ class StoreContract(RuleBasedStateMachine):
 
     @rule()
     def reopen(self) -> None:
-        """What was acknowledged is there after a restart."""
+        """What was acknowledged is there after a restart, and sound."""
         self.store.close()
         self.store = self.opened()
+        report = self.store.verify(MAP)
+        assert (report.ok, report.problems, report.stale_caches) == (True, [], [])
 
     @rule()
     def delete(self) -> None:

@@ -11,7 +11,7 @@ from core.maps import MapSettings
 from core.maps.archives.reading import Archive
 from core.maps.forms import COMPRESSED
 from core.store import Directory, Map, Store
-from tests.core.storage.archives.conftest import filled
+from tests.core.store.archives.conftest import filled
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 ID = "moved"

@@ -8,7 +8,7 @@ import pytest
 from core.errors import InvalidField
 from core.judgement.verdict import Calibration
 from core.maps import MapRecord
-from core.maps.records import merge_patch, patched_fields, patched_record
+from core.maps.records import Outline, merge_patch, patched_fields, patched_record
 from core.places import PlaceFields, Pose
 
 # The examples of RFC 7396, appendix A: target, patch, result.
@@ -131,3 +131,16 @@ def test_settings_and_calibration_of_a_map_can_be_changed() -> None:
 def test_what_a_map_cannot_have_is_refused(changes: Any) -> None:
     with pytest.raises(InvalidField):
         patched_record(RECORD, changes)
+
+
+def test_two_states_of_a_place_are_distinguished() -> None:
+    one = Outline(1, "a", 0, b"d", "image", None, "monday", 3, "2026")
+    assert one.same_as(Outline(9, "a", 7, b"d", "none", None, "monday", 3, "2026")), "numbers and rows are a map's own"
+    for other in (
+        Outline(1, "a", 0, b"e", "image", None, "monday", 3, "2026"),
+        Outline(1, "a", 0, b"d", "image", "front", "monday", 3, "2026"),
+        Outline(1, "a", 0, b"d", "image", None, "tuesday", 3, "2026"),
+        Outline(1, "a", 0, b"d", "image", None, "monday", 4, "2026"),
+        Outline(1, "a", 0, b"d", "image", None, "monday", 3, "2027"),
+    ):
+        assert not one.same_as(other)

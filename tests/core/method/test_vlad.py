@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from core.maps.forms import pack_descriptors, unpack_descriptors
 from core.maps.records import Precision
 from core.method.equations import Normalization, matching_score, vlad
 from core.method.vlad import aggregate, are_normalized, scores
-from core.maps.forms import pack_descriptors, unpack_descriptors
 from service.maps.imports import LENGTH_TOLERANCES
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +41,6 @@ def trials(folder: Path, encoder: Encoder, index: str) -> Trials:
     settings = MapSettings(keep="none", index=index)  # type: ignore[arg-type]
     dense = atlas.create("dense", encoder.identity, encoder.dimension, settings, encoder.local_shape)
     dense.enrol(walk(encoder))
-    while dense.index_status().state == "building":
-        time.sleep(0.01)
     snapshot = dense.snapshot()
     queries = queries_from_map(dense, snapshot, QUERIES)
     found = run_trials(dense, encoder, snapshot, queries, encoder.calibration, lambda _done, _all: None)

@@ -12,14 +12,13 @@ from benchmarks.geometry.pose import CAMERA, Hall, rotation
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-from core.store import Map
 from core.maps import MapSettings
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import load_xfeat
 from core.places import PlaceFields, Pose, Whereabouts
 from core.recognition.pose_survey import SATELLITES, place_errors, pose_survey, turned_note
 from core.recognition.recognition import describe
-from core.store import Directory
+from core.store import Directory, Map
 from tests.service.scenes import scene
 
 Array = NDArray[np.float64]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -76,8 +75,6 @@ def test_neighbours_that_fill_the_shortlist_do_not_hide_rivals(
     )
     crowded.enrol([enrolment(f"p{i}", encoding) for i, encoding in enumerate(seen)])
     crowded.enrol([replace(enrolment("p3", seen[3]), id=f"again{i}") for i in range(40)])
-    while crowded.index_status().state == "building":
-        time.sleep(0.01)
     rows, _ = crowded.snapshot().search(query.descriptor)
     assert len(rows) == 20 and {place and place.id[:5] for place in crowded.places_at(rows.tolist())} <= {"p3", "again"}
     (found,) = locate(crowded, encoder, [Query(query)])

@@ -21,7 +21,6 @@ from core.recognition.recognition import Answer, locate
 from core.recognition.stages import neighborhood_of
 from core.store import Directory, Map
 from core.upkeep.redundancy import neighbour_pairs, stops
-from tests.core.store.settled import settled
 from tests.service.scenes import scene
 
 PLACES, SPOT, LOOKS = 12, 5, 120
@@ -123,7 +122,7 @@ def test_several_stops_hide_none_of_the_other_places(atlas: Directory, encoder: 
         for number, shown in enumerate(looks.get(place, [one]))
     ]
     map_ = enrolled(atlas, encoder, frames)
-    assert settled(map_).tier == "compact"
+    assert map_.snapshot() and map_.index_status().tier == "compact"
     answer = ask(map_, encoder, encoder.encode(noisy(scene(SPOT), 1000)))
     assert place_of(answer) == str(SPOT)
     assert set(answer.candidates.whereabouts.ordinal.tolist()) == set(range(PLACES))

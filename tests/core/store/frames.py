@@ -17,6 +17,7 @@ DIMENSION = 16
 LOCAL_SHAPE = (3, 5)
 """An odd number of bytes, so that nothing behind them in a record lies where a processor would want it."""
 
+
 def stored_of(name: str, dimension: int = 16) -> NDArray[np.float32]:
     """What a map made today keeps of :func:`descriptor_of`."""
     return descriptor_of(name, dimension).astype(np.float16).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What the contract of all stores leaves open: several clients at the same time, versions, servers that are gone."""
+"""What the contract of all stores leaves open of PostgreSQL: several services at the same time, versions, restores."""
 
 from __future__ import annotations
 
@@ -10,22 +10,20 @@ from pathlib import Path
 
 import psycopg
 import pytest
-from core.postgres import rows
-from core.postgres.map import PostgresMap
 
 from core.errors import MapExists, StorageFailure, StoreOfAnotherVersion, StoreUnavailable, UnknownPlace
-from core.ledger.maps import frames
+from core.ledger.maps import frames, rows
 from core.maps import MapSettings, ReviewSetting
 from core.maps.archives.reading import Archive
 from core.maps.forms import COMPRESSED
-from core.store import Directory
+from core.store import Directory, Map
 from core.store.cluster import Cluster
 from tests.core.maps.mixed import check_one_kind_wins
 from tests.core.maps.moves import ID, check_a_refused_import_leaves_nothing, check_moves
 from tests.core.maps.review import check_pages_are_of_one_moment
 from tests.core.maps.writers import check_writers_lose_nothing
-from tests.core.storage.archives.conftest import filled
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from tests.core.store.archives.conftest import filled
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 from tests.servers.postgres import Postgres
 
 pytestmark = [pytest.mark.postgres, pytest.mark.timeout(300)]
@@ -34,13 +32,13 @@ pytestmark = [pytest.mark.postgres, pytest.mark.timeout(300)]
 @pytest.fixture
 def store(postgres: Postgres) -> Iterator[Cluster]:
     store = Cluster(postgres.address)
+    store.check_writable()  # makes the tables
     yield store
-    for one in store.records(None, 100)[0]:
-        store.delete(one.id)
     store.close()
+    execute(postgres, "DELETE FROM maps")
 
 
-def made(store: Cluster) -> PostgresMap:
+def made(store: Cluster) -> Map:
     return store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
 
 
@@ -75,34 +73,26 @@ def test_a_page_for_review_is_of_one_moment(store: Cluster) -> None:
     check_pages_are_of_one_moment(made(store).review, store.get("lab").review)
 
 
-def test_pictures_take_room(store: Cluster) -> None:
-    lab = store.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
-    lab.enrol([frame("a"), frame("bee")])
-    room = lab.storage_status()
-    assert room.keypoints is not None
-    assert room.database == len(b"image of a") + len(b"image of bee") + room.keypoints.bytes
-
-
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "problem"),
     [
-        ("DELETE FROM pictures WHERE row = 1", "place 'b' is recorded to keep image, which is not true"),
-        ("UPDATE pictures SET bytes = 'image of B' WHERE row = 1", "the image of place 'b' does not match its digest"),
+        ("DELETE FROM pictures WHERE row = 1", "is recorded to keep image, which is not true"),
+        ("UPDATE pictures SET bytes = 'image of B' WHERE row = 1", "has a stored image that does not match its digest"),
         (
             "UPDATE pictures SET bytes = 'image of B', digest = sha256('image of B') WHERE row = 1",
-            "the image of place 'b' does not match its digest",
+            "has an image that does not match its digest",
         ),
     ],
     ids=["lost", "damaged", "another"],
 )
-def test_a_wrong_picture_is_reported(postgres: Postgres, store: Cluster, damage: str, said: str) -> None:
+def test_a_wrong_picture_is_reported(postgres: Postgres, store: Cluster, damage: str, problem: str) -> None:
     lab = store.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
     lab.enrol([frame("a"), frame("b")])
     assert store.verify("lab").ok
     execute(postgres, damage)
     report = store.verify("lab")
-    assert not report.ok and report.problems == [f"PostgreSQL: {said}"]
-    assert lab.picture("a") == b"image of a"
+    assert not report.ok and report.problems == [f"PostgreSQL: place 'b' {problem}"]
+    assert lab.picture("a") == b"image of a" and store.quarantined() == {}
 
 
 @pytest.mark.parametrize("damage", ["DELETE FROM review_pictures", "UPDATE review_pictures SET bytes = 'another'"])
@@ -115,6 +105,32 @@ def test_a_wrong_picture_for_review_is_not_shown(postgres: Postgres, store: Clus
     for one in review.page(None, 10).frames:
         with pytest.raises(StorageFailure, match="damaged"):
             review.picture(one.number)
+
+
+def test_damage_is_a_failure_of_each_use_and_not_of_the_map(postgres: Postgres, store: Cluster) -> None:
+    lab = made(store)
+    lab.enrol([frame("a"), frame("b")])
+    store.close()
+    later = Cluster(postgres.address)
+    execute(postgres, "UPDATE descriptors SET bytes = set_byte(bytes, 0, get_byte(bytes, 0) # 1) WHERE row = 1")
+    for _ in range(2):
+        with pytest.raises(StorageFailure, match="Map 'lab' is damaged: row 1 of descriptors does not match"):
+            later.get("lab").snapshot()
+    assert later.quarantined() == {} and later.get("lab").place("b").id == "b"
+    later.get("lab").forget("b")
+    assert len(later.get("lab").snapshot()) == 1
+    later.close()
+
+
+def test_a_closed_store_refuses_the_maps_that_are_held(store: Cluster) -> None:
+    lab = made(store)
+    lab.enrol([frame("a")])
+    held = lab.snapshot()
+    store.close()
+    for use in (lab.snapshot, lambda: lab.enrol([frame("b")]), lambda: lab.place("a"), lambda: store.get("lab")):
+        with pytest.raises(StorageFailure, match="closed"):
+            use()
+    assert len(held) == 1
 
 
 def test_a_refused_import_leaves_nothing(store: Cluster, tmp_path: Path) -> None:
@@ -175,15 +191,15 @@ def test_rows_that_no_place_has_are_deleted_a_while_later(store: Cluster, monkey
 
     def stored() -> tuple[set[int], set[int]]:
         with lab.viewing() as (connection, _):
-            return set(rows.both_at(connection, range(9))), set(frames.pictures_at(connection, range(9)))
+            return set(rows.at(connection, "descriptors", range(9))), set(frames.pictures_at(connection, range(9)))
 
     assert stored() == ({0, 1, 2}, {0, 1, 2})  # a query that is under way may read them
-    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    monkeypatch.setattr(rows, "LEFT_SECONDS", -1)
     lab.enrol([frame("c")])
     assert stored() == ({2, 3}, {2, 3})
 
 
-@pytest.mark.parametrize("by", [-1, 1])
+@pytest.mark.parametrize("by", [-2, 1])
 def test_tables_of_another_version(postgres: Postgres, store: Cluster, by: int) -> None:
     made(store)
     ((version,),) = execute(postgres, "SELECT version FROM placerec_tables WHERE part = 'maps'")
@@ -214,7 +230,7 @@ def test_erased_places_leave_no_row(postgres: Postgres, store: Cluster, monkeypa
     lab.forget_sequence("monday")
     left = "SELECT count(*) FROM descriptors UNION ALL SELECT count(*) FROM pictures"
     assert execute(postgres, left) == [(6,), (6,)]  # a query may still need them
-    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    monkeypatch.setattr(rows, "LEFT_SECONDS", -1)
     report = lab.erase()
     assert (report.rows, execute(postgres, left)) == (3, [(3,), (3,)])
     assert lab.erase().rows == 0 and lab.count_places() == 3
@@ -228,7 +244,7 @@ def test_erased_looks_leave_no_row(postgres: Postgres, store: Cluster, monkeypat
     assert follower.get("lab").snapshot().alive.sum() == 4 and follower.get("lab").thumbnail(f"p1/{'0' * 16}")
     lab.forget("p1")
     assert lab.forget_looks([f"p2/{'1' * 16}", "p2", f"p1/{'0' * 16}"]) == 1
-    monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
+    monkeypatch.setattr(rows, "LEFT_SECONDS", -1)
     left = " UNION ALL ".join(f"SELECT count(*) FROM {table}" for table in ("descriptors", "pictures", "keypoints"))
     assert (lab.erase().rows, execute(postgres, left)) == (3, [(1,), (1,), (1,)])
     # Another service neither finds nor shows them any more.

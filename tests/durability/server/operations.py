@@ -106,9 +106,7 @@ def _delete(world: World, operation: Operation) -> None:
 
 
 def _import(world: World, operation: Operation) -> None:
-    world[operation["to"]] = made = copy.deepcopy(_map(world, operation))
-    for number, place in enumerate(made.places.values()):
-        place.picture = number  # an archive does not say which places got another picture
+    world[operation["to"]] = _map(world, operation).imported()
 
 
 _APPLIED: dict[str, Callable[[World, Operation], Any]] = {

@@ -11,7 +11,6 @@ import json
 import os
 import signal
 import socket
-import sqlite3
 import sys
 import threading
 import traceback
@@ -24,19 +23,25 @@ import numpy as np
 
 from core.errors import PlacerecError
 from core.frames.masks import Mask
-from core.maps import Correspondence, Enrolment, History, MapSettings
-from core.places import PlaceFields
-from core.store import Directory, opening
-from core.storage.database import connections as database
+from core.ledger.maps import rows
+from core.maps import Correspondence, Enrolment, History, MapSettings, ReviewSetting
+from core.maps.archives.reading import Archive
 from core.maps.forms import inner_products, pack_descriptors
-from core.storage.search import index_files, recall
+from core.places import PlaceFields
+from core.store import Directory, file, recall, tiers
 from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, keypoints_of
 from tests.durability.contents import contents, map_contents
-from tests.durability.storage.operations import Operation, enrolment, look_enrolment, pictures
+from tests.durability.storage.operations import Operation, enrolment, image_of, look_enrolment, pictures
 
 ROWS_PER_SEGMENT = 4
-GROUP_ROWS = 8
-"""Small, so that a handful of places makes files of codes."""
+COMPACT_FROM, ON_DISK_FROM = 8, 16
+"""Small, so that a handful of places is searched by codes, and some more are not held in memory."""
+
+MOST_OPEN = 2
+"""Fewer than there are maps, so that their files are closed and opened again all the time."""
+
+LEFT_SECONDS = 0
+"""What no place shows any more is deleted right behind each write."""
 
 QUERIES = 8
 """By which the recall of an index is measured; few, since that is done again and again here."""
@@ -74,18 +79,19 @@ class Storage:
     """The data directory and what can be done with it."""
 
     def __init__(self, directory: Path) -> None:
-        index_files.GROUP_ROWS, recall.QUERIES = GROUP_ROWS, QUERIES
+        vars(tiers).update(COMPACT_FROM=COMPACT_FROM, ON_DISK_FROM=ON_DISK_FROM)
+        recall.QUERIES, rows.LEFT_SECONDS = QUERIES, LEFT_SECONDS
         self._directory, self._gate = directory, Gate()
         self._open()
 
     def _open(self) -> None:
-        self._atlas = Directory(self._directory, rows_per_segment=ROWS_PER_SEGMENT)
+        self._store = Directory(self._directory, MOST_OPEN, rows_per_segment=ROWS_PER_SEGMENT)
 
     def do(self, operation: Operation) -> Answer:
         """The answer to an operation, or the name of the error that it met."""
         if operation["do"] == "reopen":
             with self._gate.alone():
-                self._atlas.close()
+                self._store.close()
                 self._open()
             return {"answer": None}
         with self._gate.shared():
@@ -97,83 +103,83 @@ class Storage:
                 return {"failure": str(error)[:2000]}
 
     def _contents(self, operation: Operation) -> Answer:
-        return {"answer": contents(self._atlas)}
+        return {"answer": contents(self._store)}
 
     def _look(self, operation: Operation) -> Answer:
-        return {"answer": None, "found": map_contents(self._atlas.get(operation["map"]), True)}
+        return {"answer": None, "found": map_contents(self._store.get(operation["map"]), True)}
 
     def _create(self, operation: Operation) -> None:
         settings = MapSettings(**operation["settings"])
         precision, unlisted = operation["precision"], operation["unlisted"]
-        self._atlas.create(operation["map"], ENCODER, DIMENSION, settings, LOCAL_SHAPE, unlisted, precision)
+        self._store.create(operation["map"], ENCODER, DIMENSION, settings, LOCAL_SHAPE, unlisted, precision)
 
     def _enrol(self, operation: Operation) -> Answer:
         items = [enrolment(**item) for item in operation["items"]]
-        done = self._atlas.get(operation["map"]).enrol(items)
+        done = self._store.get(operation["map"]).enrol(items)
         told = {place.id: place.model_dump(mode="json") for place, _ in done}  # the last of each id
         return {"answer": [change for _, change in done], "places": list(told.values())}
 
     def _set(self, operation: Operation) -> Answer:
         fields = PlaceFields.model_validate(operation["fields"])
-        place, change = self._atlas.get(operation["map"]).set_fields(operation["id"], fields)
+        place, change = self._store.get(operation["map"]).set_fields(operation["id"], fields)
         return {"answer": change, "places": [place.model_dump(mode="json")]}
 
     def _patch(self, operation: Operation) -> Answer:
-        place = self._atlas.get(operation["map"]).patch(operation["id"], operation["changes"])
+        place = self._store.get(operation["map"]).patch(operation["id"], operation["changes"])
         return {"answer": None, "places": [place.model_dump(mode="json")]}
 
     def _forget(self, operation: Operation) -> None:
-        self._atlas.get(operation["map"]).forget(operation["id"])
+        self._store.get(operation["map"]).forget(operation["id"])
 
     def _forget_sequence(self, operation: Operation) -> Answer:
-        return {"answer": self._atlas.get(operation["map"]).forget_sequence(operation["name"])}
+        return {"answer": self._store.get(operation["map"]).forget_sequence(operation["name"])}
 
     def _forget_many(self, operation: Operation) -> Answer:
-        map_ = self._atlas.get(operation["map"])
+        map_ = self._store.get(operation["map"])
         digests = {place_id: map_.digest(place_id) or b"" for place_id in operation["ids"]}
         return {"answer": map_.transfer.forget(digests)}
 
     def _looks(self, operation: Operation) -> Answer:
         items = [look_enrolment(**item) for item in operation["items"]]
-        done = self._atlas.get(operation["map"]).enrol(items)
+        done = self._store.get(operation["map"]).enrol(items)
         return {"answer": [change for _, change in done]}
 
     def _forget_look(self, operation: Operation) -> None:
-        self._atlas.get(operation["map"]).forget_look(operation["id"], operation["look"])
+        self._store.get(operation["map"]).forget_look(operation["id"], operation["look"])
 
     def _forget_learnt(self, operation: Operation) -> Answer:
-        return {"answer": self._atlas.get(operation["map"]).forget_learnt(operation["run"])}
+        return {"answer": self._store.get(operation["map"]).forget_learnt(operation["run"])}
 
     def _edit(self, operation: Operation) -> Answer:
-        return {"answer": self._atlas.get(operation["map"]).edit(operation["changes"]).revision}
+        return {"answer": self._store.get(operation["map"]).edit(operation["changes"]).revision}
 
     def _keypoints(self, operation: Operation) -> Answer:
-        map_ = self._atlas.get(operation["map"])
+        map_ = self._store.get(operation["map"])
         found = [(one, keypoints_of(pictures()[one.digest])) for one in map_.without_keypoints(0, operation["limit"])]
         return {"answer": map_.add_keypoints(found)}
 
     def _counterparts(self, operation: Operation) -> None:
-        map_ = self._atlas.get(operation["map"])
-        rows = {place.id: place.row for place in map_.transfer.outline()}
+        map_ = self._store.get(operation["map"])
+        row_of = {place.id: place.row for place in map_.transfer.outline()}
         where = map_.snapshot().whereabouts
         stations = {
-            rows[place_id]: (int(where.track[rows[other]]), int(where.station[rows[other]]))
+            row_of[place_id]: (int(where.track[row_of[other]]), int(where.station[row_of[other]]))
             for place_id, other in operation["stations"]
         }
-        poses: dict[int, int | None] = {rows[place_id]: rows[other] for place_id, other in operation["poses"]}
+        poses: dict[int, int | None] = {row_of[place_id]: row_of[other] for place_id, other in operation["poses"]}
         map_.counterparts.store(Correspondence(stations, poses))
 
     def _camera(self, operation: Operation) -> Answer:
         mask = None if operation["mask"] is None else Mask.model_validate(operation["mask"])
-        return {"answer": self._atlas.get(operation["map"]).cameras.put(operation["name"], mask)[1]}
+        return {"answer": self._store.get(operation["map"]).cameras.put(operation["name"], mask)[1]}
 
     def _forget_camera(self, operation: Operation) -> None:
-        self._atlas.get(operation["map"]).cameras.forget(operation["name"])
+        self._store.get(operation["map"]).cameras.forget(operation["name"])
 
     def _adopt(self, operation: Operation) -> None:
-        source = self._atlas.get(operation["from"])
-        unlisted = self._atlas.unlisted()
-        target = unlisted.get(operation["map"]) or self._atlas.get(operation["map"])
+        source = self._store.get(operation["from"])
+        unlisted = self._store.unlisted()
+        target = unlisted.get(operation["map"]) or self._store.get(operation["map"])
         digests = {place.id: place.digest for place in source.transfer.outline()}
         snapshot, items = source.snapshot(), []
         for place_id, ordinal in operation["places"]:
@@ -193,14 +199,41 @@ class Storage:
             items.append((item, History(place.picture, ordinal, place.created_at, place.updated_at)))
         target.transfer.adopt(items)
 
+    def _erase(self, operation: Operation) -> None:
+        self._store.get(operation["map"]).erase()
+
+    def _rebuild(self, operation: Operation) -> None:
+        self._store.get(operation["map"]).rebuild_index()
+
+    def _import(self, operation: Operation) -> None:
+        exported = self._directory.with_name(f"{self._directory.name}-{operation['to']}.tar")
+        exported.unlink(missing_ok=True)  # a killed process may have left it
+        self._store.get(operation["map"]).exporter.write(exported)
+        with Archive(exported) as archive:
+            self._store.import_map(archive, operation["to"], lambda *_: None, lambda _: None, 1 << 20, lambda _: None)
+        exported.unlink()
+
+    def _review(self, operation: Operation) -> Answer:
+        setting = ReviewSetting(most_frames=operation["most"])
+        review = self._store.get(operation["map"]).review
+        return {"answer": review.keep(image_of(operation["picture"]), operation["answer"], setting)}
+
+    def _label(self, operation: Operation) -> None:
+        review = self._store.get(operation["map"]).review
+        review.label(review.page(None, 50).frames[operation["at"]].number, operation["label"])
+
+    def _discard(self, operation: Operation) -> None:
+        review = self._store.get(operation["map"]).review
+        review.discard(review.page(None, 50).frames[operation["at"]].number)
+
     def _delete(self, operation: Operation) -> None:
-        self._atlas.delete(operation["map"])
+        self._store.delete(operation["map"])
 
     def _publish(self, operation: Operation) -> None:
-        self._atlas.publish(operation["map"])
+        self._store.publish(operation["map"])
 
     def _abandon(self, operation: Operation) -> None:
-        self._atlas.abandon(operation["map"])
+        self._store.abandon(operation["map"])
 
 
 def _serve(storage: Callable[[], Storage], connection: socket.socket) -> None:
@@ -236,29 +269,21 @@ def _warm_up() -> None:
     inner_products(vectors[:1], kept, "compressed")
 
 
-UNSYNCED = ("log", "descriptors", "names")
+UNSYNCED = ("log", "names")
 
 
 def _leave_unsynced(what: str) -> None:
-    """Break the storage layer: leave SQLite's log, segment files or folders unsynced, for a test of the harness."""
-    sync, connect = os.fsync, database.connect
+    """Break the storage layer: leave SQLite's log, or folders, unsynced, for a test of the harness."""
+    sync = os.fsync
 
-    def sync_others(file: int) -> None:
-        path = Path(os.readlink(f"/proc/self/fd/{file}"))
-        if path.suffix == ".seg" if what == "descriptors" else path.is_dir():
-            return
-        sync(file)
-
-    def connect_weakly(path: Path, create: bool = False) -> sqlite3.Connection:
-        connection = connect(path, create)
-        connection.execute("PRAGMA synchronous = OFF")
-        return connection
+    def sync_files(descriptor: int) -> None:
+        if not Path(os.readlink(f"/proc/self/fd/{descriptor}")).is_dir():
+            sync(descriptor)
 
     if what == "log":
-        database.connect = connect_weakly
-        vars(opening)["connect"] = connect_weakly
+        vars(file)["_SETTINGS"] |= {"synchronous": "OFF"}
     else:
-        vars(os)["fsync"] = sync_others
+        vars(os)["fsync"] = sync_files
 
 
 def main(unsynced: str | None = None) -> None:

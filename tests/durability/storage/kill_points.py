@@ -1,8 +1,9 @@
 """A fixed run of the storage layer, killed at every call by which it writes: once before each, for each kind of call.
 
 What was written by one call is on disk, for all that a killed process can tell, when the next one begins; so a kill
-before every call is also a kill after every one, the making of a file by opening it included.  Calls are counted by
-thread, so that the thread that builds the index is met as well.
+before every call is also a kill after every one, the making of a file by opening it included.  These are the steps of a
+COMMIT, of the transaction that deletes what no place shows any more, of closing a file, of a checkpoint and of
+rewriting a file, and of making, importing, publishing and deleting a map.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.durability.model import Lost
-from tests.durability.storage.kills import Worker
+from tests.durability.storage.kills import Worker, expect_erased
 from tests.durability.storage.power_cuts import attach
 from tests.durability.storage.processes import ProcessEnded, StorageProcesses
 from tests.syscalls import strace
@@ -62,6 +63,7 @@ def kill_at(processes: StorageProcesses, folder: Path, seed: object, point: Poin
     tracer += ["-e", f"inject={call}:signal=KILL:when={number}"]
     directory = folder / f"{call}-{number}"
     worker, met = _run(processes, directory, tracer, seed, may_be_killed=True)
+    expect_erased(directory, *worker.candidates)
     process = processes.begin(directory)
     try:
         worker.settle(process.connections[0].ask({"do": "contents"})["answer"])

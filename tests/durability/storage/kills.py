@@ -10,7 +10,7 @@ from random import Random
 from typing import Any
 
 from tests.durability.model import Lost, World, changed, differences, settled
-from tests.durability.storage.operations import Operation, apply, chosen
+from tests.durability.storage.operations import Operation, apply, chosen, pictures, traces_of
 from tests.durability.storage.processes import Connection, ProcessEnded, StorageProcess, StorageProcesses
 
 WORKERS = 2
@@ -79,6 +79,23 @@ class Worker:
         self.acknowledged += 1
 
 
+def expect_erased(directory: Path, *worlds: World) -> None:
+    """Search all files of the maps for what was erased, before as well as after the last operation.
+
+    Raises:
+        Lost: there is something of it.
+    """
+    first, *others = worlds
+    for name, map_ in first.items():
+        erased = map_.erased.intersection(*(world[name].erased if name in world else set() for world in others))
+        folder = directory / "maps" / (name if map_.listed else f".unlisted-{name}")
+        found = b"\0".join(path.read_bytes() for path in folder.glob("*") if not path.name.endswith("-shm"))
+        for digest in erased:
+            picture = pictures()[bytes.fromhex(digest)]
+            if any(trace in found for trace in traces_of(picture)):
+                raise Lost(f"map {name}: its files have something of {picture}, which was erased")
+
+
 @dataclass
 class Tally:
     """Counts of a campaign."""
@@ -134,6 +151,8 @@ class StorageKills:
     def _run_until_killed(self, processes: StorageProcesses, random: Random) -> None:
         opening = random.random() < KILLED_WHILE_OPENING
         last, delay = random.randrange(1, MOST_OPERATIONS), random.random() ** 2 * (0.06 if opening else 0.01)
+        for worker in self.workers:
+            expect_erased(self.directory, *worker.candidates)
         process = processes.begin(self.directory)
         killed = threading.Event()
 
@@ -157,6 +176,8 @@ class StorageKills:
                         if worker.number == 0 and worker.done == until and not opening:
                             killer.start()
                         worker.acknowledge(connection.answer())
+                        if worker.last[-1]["do"] == "erase":
+                            expect_erased(self.directory, *worker.candidates)
                 except ProcessEnded:
                     if not killed.is_set():
                         failures.append(Lost(f"the process ended by itself: {self.folder / 'log'}"))

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from core.maps import Enrolment, MapSettings
+from core.maps.forms import pack_descriptors, pack_local, unpack_descriptors, unpack_local
 from core.maps.records import Precision
 from core.places import PlaceFields, look_address
-from core.maps.forms import pack_descriptors, pack_local, unpack_descriptors, unpack_local
 from tests.core.store.frames import DIMENSION, LOCAL_SHAPE, descriptor_of, digest_of, keypoints_of, local_of
 from tests.durability.contents import sha
 from tests.durability.model import MapModel, Refused, Shown, World
@@ -82,6 +82,18 @@ def enrolment(id: str, picture: str, fields: dict[str, Any], keypoints: bool) ->
         image_of(picture),
         keypoints_of(picture) if keypoints else None,
     )
+
+
+@lru_cache(maxsize=4096)
+def traces_of(picture: str) -> list[bytes]:
+    """Bytes that a file has only if it has something of a picture, in any form in which a map stores it."""
+    kept: tuple[Precision, ...] = ("half", "compressed")
+    found = [
+        keypoints_of(picture).record(),
+        *(pack_descriptors(descriptor_of(picture)[np.newaxis], name).tobytes() for name in kept),
+    ]
+    image = image_of(picture)
+    return [*found, image[:128]] if len(image) >= 256 else found  # shorter ones may be the beginning of another's
 
 
 @lru_cache(maxsize=1)
@@ -167,6 +179,26 @@ def _counterparts(world: World, operation: Operation) -> None:
     _map(world, operation["map"]).store_counterparts(operation["stations"], operation["poses"])
 
 
+def _import(world: World, operation: Operation) -> None:
+    source = _map(world, operation["map"])
+    if operation["to"] in world:
+        raise Refused("MapExists")
+    world[operation["to"]] = source.imported()
+
+
+def _review(world: World, operation: Operation) -> bool:
+    digest = hashlib.sha256(image_of(operation["picture"])).hexdigest()
+    return _map(world, operation["map"]).keep_for_review(digest, operation["answer"], operation["most"])
+
+
+def _label(world: World, operation: Operation) -> None:
+    _map(world, operation["map"]).review[operation["at"]][2] = operation["label"]
+
+
+def _discard(world: World, operation: Operation) -> None:
+    del _map(world, operation["map"]).review[operation["at"]]
+
+
 def _delete(world: World, operation: Operation) -> None:
     _map(world, operation["map"])
     del world[operation["map"]]
@@ -203,6 +235,12 @@ _APPLIED: dict[str, Callable[[World, Operation], Any]] = {
     "delete": _delete,
     "publish": _publish,
     "abandon": _abandon,
+    "erase": lambda world, o: _map(world, o["map"]).erase(),
+    "rebuild": lambda world, o: None,
+    "import": _import,
+    "review": _review,
+    "label": _label,
+    "discard": _discard,
     "look": lambda world, o: None,
     "reopen": lambda world, o: None,
 }
@@ -228,8 +266,9 @@ def chosen(random: Random, world: World, prefix: str) -> Operation:
     if len(map_.places) > LARGEST_MAP and random.random() < 0.5:
         return {"do": "delete", "map": name}
     kinds = ("enrol", "enrol", "enrol", "batch", "batch", "fields", "patch", "forget", "sequence", "many", "edit",
-             "looks", "unlook", "keypoints", "counterparts", "camera", "adopt", "delete", "look", "reopen")  # fmt: skip
-    weights = (6, 6, 6, 5, 5, 4, 5, 3, 0.7, 1, 2, 8, 2, 2, 3, 2, 3, 0.7, 4, 0.5)
+             "looks", "unlook", "keypoints", "counterparts", "camera", "adopt", "delete", "look", "reopen",
+             "erase", "rebuild", "import", "review")  # fmt: skip
+    weights = (6, 6, 6, 5, 5, 4, 5, 3, 0.7, 1, 2, 8, 2, 2, 3, 2, 3, 0.7, 4, 0.5, 4, 1, 2, 4)
     kind = random.choices(kinds, weights)[0]
     return _CHOSEN[kind](random, world, name, listed) or _batch(random, world, name, listed)
 
@@ -394,6 +433,25 @@ def _adopted(random: Random, world: World, name: str, listed: list[str]) -> Oper
     return {"do": "adopt", "map": name, "from": source, "places": places}
 
 
+def _imported(random: Random, world: World, name: str, listed: list[str]) -> Operation | None:
+    """A copy of a map by way of an export file, perhaps under an id that is taken."""
+    prefix, _, _ = name.partition("-")
+    return {"do": "import", "map": name, "to": f"{prefix}-{random.randrange(MAPS)}"}
+
+
+def _reviewed(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    there = world[name].review
+    if not there or random.random() < 0.6:
+        picture, answer = f"picture {random.randrange(PICTURES)}", {"verdict": "unknown", "score": random.random()}
+        return {"do": "review", "map": name, "picture": picture, "answer": answer, "most": random.choice([2, 4, 8])}
+    at = random.randrange(len(there))
+    if random.random() < 0.4:
+        return {"do": "discard", "map": name, "at": at}
+    shows = random.choice([{"place": "p1"}, {"new": "p2"}, {"stranger": True}])
+    label = {"label": shows, "at": "2026-12-01T22:00:00+00:00", "by": random.choice([None, "somebody"])}
+    return {"do": "label", "map": name, "at": at, "label": label}
+
+
 _Chosen = Callable[[Random, World, str, list[str]], Operation | None]
 _CHOSEN: dict[str, _Chosen] = {
     "enrol": _one,
@@ -413,4 +471,8 @@ _CHOSEN: dict[str, _Chosen] = {
     "delete": lambda random, world, name, listed: {"do": "delete", "map": name},
     "look": lambda random, world, name, listed: {"do": "look", "map": name},
     "reopen": lambda random, world, name, listed: {"do": "reopen"},
+    "erase": lambda random, world, name, listed: {"do": "erase", "map": name},
+    "rebuild": lambda random, world, name, listed: {"do": "rebuild", "map": name},
+    "import": _imported,
+    "review": _reviewed,
 }

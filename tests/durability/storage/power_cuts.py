@@ -11,7 +11,7 @@ from pathlib import Path
 from random import Random
 
 from tests.durability.model import Lost, World, settled
-from tests.durability.storage.kills import Worker
+from tests.durability.storage.kills import Worker, expect_erased
 from tests.durability.storage.processes import ProcessEnded, StorageProcess, StorageProcesses
 from tests.durability.traced_disk import VARIANTS, Disk, arguments
 
@@ -141,6 +141,7 @@ def check(processes: StorageProcesses, directory: Path, may: Sequence[World]) ->
         Lost: none of them is.
         ProcessEnded: it does not open.
     """
+    expect_erased(directory, *may)
     process = processes.begin(directory)
     try:
         settled(may, process.connections[0].ask({"do": "contents"})["answer"])

@@ -30,7 +30,7 @@ def test_held_memory_is_reported(strict: Server) -> None:
     assert value("placerec_upload_bytes") >= 1000
     assert value("placerec_sessions") >= 1 and value("placerec_job_watchers") == 0
     assert value("placerec_event_listeners") == 0
-    assert value("placerec_maps_searched", tier="exact") >= 1 and value("placerec_indexes_building") == 0
+    assert value("placerec_maps_searched", tier="exact") >= 1
     assert 0 < value("placerec_disk_free_bytes") < value("placerec_disk_bytes")
     assert value("placerec_commit_seconds_count") >= 1 and value("placerec_stopping") == 0
     assert {dict(labels)["state"] for name, labels in found if name == "placerec_jobs"} >= {"queued", "running"}

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from core.store import Map
 from core.maps.archives.reading import Archive, check
+from core.store import Map
 from service.app.runtime import Runtime
 from service.backups.backups import AGAIN, PATIENCE, SETTLED, Backups
 from service.backups.index import INDEX

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,8 @@ def encoder() -> Encoder:
 
 @pytest.fixture(scope="module")
 def map_(encoder: Encoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
-    with map_of_scenes(encoder, tmp_path_factory.mktemp("atlas"), 4) as made:
+    with map_of_scenes(encoder, tmp_path_factory.mktemp("maps"), 4) as made:
+        made.open()
         yield made
 
 
@@ -66,11 +66,13 @@ def test_searches_that_may_take_long_are_not_done_ahead(
     map_: Map, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert search_ahead(map_, QueryParameters(sequences="monday").question()) is None
-    search, now = search_ahead(map_, Question(3)), map_.snapshot()
+    search = search_ahead(map_, Question(3))
     assert search is not None
-    with monkeypatch.context() as patched:
-        patched.setattr(map_, "_snapshot", replace(now, holds=False))
-        assert search(encoded(encoder, scene(0))) is None, "what is on the disk may take long"
+    for setting, is_held in (("compact", False), ("auto", True)):
+        map_.edit({"index": setting})
+        map_.open()
+        found = search(encoded(encoder, scene(0)))
+        assert (found is not None) == is_held, "what is on the disk may take long"
     monkeypatch.setattr(searches, "MOST_AHEAD", 3)
     assert search_ahead(map_, Question(3)) is None
 

@@ -13,12 +13,11 @@ import pytest
 from core.errors import TooManyLooks
 from core.frames.images import decode
 from core.maps import Enrolment, LearningSetting, MapSettings, ReviewSetting
-from core.store import Map
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields, look_address
 from core.recognition.recognition import describe
-from core.store import Directory
+from core.store import Directory, Map
 from service.engine.encoders import Encoded
 from service.learning.adoption import NOTHING, Adoption, Took, WaitingFrame, graph_of, waiting_frames
 from tests.service.scenes import jpeg

@@ -10,10 +10,10 @@ from threading import Thread
 import pytest
 
 from core.errors import UnknownStretch
-from core.store import Map
 from core.maps import ReviewSetting
 from core.maps.records import MOST_POSES, MOST_REJECTED
 from core.places import Pose
+from core.store import Map
 from service.app.runtime import Runtime
 from service.errors.faults import TooManyPlaces
 from service.jobs.context import creation_time

@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 
 from core.disk.files import write_at
+from core.ledger.maps import places
 from core.maps import MapSettings
-from core.storage.archives import unpacking
-from core.storage.files import segment_files as descriptors
+from core.maps.archives import unpacking
 from service.app.runtime import Runtime
 from service.errors.faults import TooManyImports
 from service.maps import imports
 from service.maps.imports import ReceivedFile
-from tests.core.storage.archives.files import exported
+from tests.core.store.archives.files import exported
 from tests.service.engines import ENCODER, enrolments, runtime_at
 
 
@@ -101,9 +101,9 @@ async def test_cancelled_while_the_map_is_built(
         # The encoder of the test maps does not exist, so that nothing is known of the length of its descriptors.
         monkeypatch.setattr(runtime.imports, "check_encoder", lambda _: SimpleNamespace(definition=None))
         monkeypatch.setattr(unpacking, "CHUNK_BYTES", 1)
-        gate = Gate(descriptors.append)
-        with monkeypatch.context() as disk:
-            disk.setattr(descriptors, "append", gate)
+        gate = Gate(places.rows_of)
+        with monkeypatch.context() as patched:
+            patched.setattr(places, "rows_of", gate)
             task = asyncio.create_task(runtime.imports.build(await received(runtime, content)))
             await gate.cancelled_there(task)
             await gate.open(task)

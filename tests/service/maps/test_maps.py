@@ -9,7 +9,8 @@ import httpx
 import pytest
 
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from tests.service.map_jobs import wait_until
+from tests.service.damage import damage
+from tests.service.map_jobs import finished
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
 
@@ -283,10 +284,7 @@ def test_after_a_kill_a_damaged_map_is_quarantined_and_the_others_serve(tmp_path
     assert server.client.put("/v1/maps/good/cameras/front", json={"mask": mask}).status_code == 201
     assert server.enrol("good", "masked", jpeg(2), camera="front").status_code == 201
     server.kill()
-    segment = next((tmp_path / "data" / "maps" / "bad").glob("*.seg"))
-    content = bytearray(segment.read_bytes())
-    content[len(content) // 2] ^= 1
-    segment.write_bytes(content)
+    damage(tmp_path / "data", "bad")
 
     server = Server(tmp_path).wait()
     client = server.client
@@ -315,7 +313,7 @@ def test_how_a_map_is_searched_is_shown_and_chosen(server: Server) -> None:
         server.enrol("tiers", f"p{index}", jpeg(index))
     view = server.client.patch(path, json={"index": "compact"}, headers={"If-Match": "*"}).json()
     assert (view["index"]["setting"], view["index"]["wanted"]) == ("compact", "compact")
-    wait_until(lambda: server.client.get(path).json()["index"]["state"] != "building")
+    assert finished(server, server.client.post(f"{path}/rebuild").json())["state"] == "succeeded"
     view = server.client.get(path).json()
     assert (view["index"]["tier"], view["index"]["rows_indexed"]) == ("compact", 3)
     assert view["index"]["recall"] == {"at_1": 1.0, "queries": 128, "shortlist": 100, "places": 3}

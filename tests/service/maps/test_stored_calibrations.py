@@ -14,8 +14,8 @@ from fastapi.testclient import TestClient
 from core.judgement.trials import StagedTrials, Trials
 from core.learning import Witness
 from core.maps import Enrolment, ReviewSetting
-from core.store import Map
 from core.places import PlaceFields
+from core.store import Map
 from service.access.audit import ASKER
 from service.app.application import create_app
 from service.learning.run_notes import RunNotes

@@ -18,7 +18,7 @@ import pytest
 
 from core.maps.archives.manifest import group_names
 from core.maps.archives.reading import Archive, check
-from tests.core.storage.archives.files import Parts, changed, line_changed, named, parts_of, sealed
+from tests.core.store.archives.files import Parts, changed, line_changed, named, parts_of, sealed
 from tests.service.encoders import install_coarse_encoder
 from tests.service.map_jobs import wait_until
 from tests.service.scenes import jpeg
@@ -175,7 +175,7 @@ def _endless_picture(manifest: dict[str, Any], parts: Parts) -> None:
 
 
 def test_hostile_files(server: Server, content: bytes) -> None:
-    """One of each kind; ``tests/core/storage/archives`` has them all."""
+    """One of each kind; ``tests/core/store/archives`` has them all."""
     manifest, parts = parts_of(content)
     for made, slug in (
         (b"", "invalid-archive"),
@@ -337,7 +337,7 @@ def test_killed_at_every_stage(apart: Path) -> None:
         assert connection.recv(100).startswith(b"HTTP/1.1 413")
     job = import_file(server, content, "by-job", background="true").headers["location"]
     making = begun(server, "/v1/maps/import?id=by-request", len(content), content)
-    wait_until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/descriptors-000001.seg")))
+    wait_until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/map.sqlite-wal")))
     arriving = begun(server, "/v1/maps/import?id=arriving", len(content), content[: len(content) // 2])
     wait_until(lambda: any(server.data_dir.glob("imports/.*")))
     wait_until(lambda: server.client.get(job).json()["progress"]["done"] > 200)

@@ -13,8 +13,8 @@ from fastapi.testclient import TestClient
 from core.judgement.trials import StagedTrials
 from core.learning import Witness
 from core.maps import Enrolment, ReviewSetting
-from core.store import Map
 from core.places import PlaceFields, look_address
+from core.store import Map
 from service.app.application import create_app
 from service.queries.histories.run_trials import RunTrials
 from service.queries.statistics import map_key

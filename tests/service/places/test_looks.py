@@ -16,9 +16,9 @@ from core.judgement.trials import StagedTrials, Trial, gathered
 from core.judgement.verdict import Judgement
 from core.learning import Witness
 from core.maps import Enrolment
-from core.store import Map
 from core.maps.records import MOST_LOOKS
 from core.places import PlaceFields, look_address
+from core.store import Map
 from service.app.application import create_app
 from service.places import looks
 from service.places.enrolment import enrol_look

@@ -11,8 +11,8 @@ import httpx
 import pytest
 
 from core.ledger.maps import places
-from core.maps import MapSettings
 from core.ledger.maps.plan import HANDED_OVER, HAS_PICTURE
+from core.maps import MapSettings
 from core.store import Directory
 from service.errors.faults import PlanTooLarge
 from service.http.headers import accepts_gzip

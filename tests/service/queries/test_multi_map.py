@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.service.damage import damage
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again, stranger
 from tests.service.server import Server, assert_item_problem, assert_problem, text, typed
@@ -32,10 +33,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         server.enrol("twin", f"t{number}", jpeg(number), x=10 * number, y=0)
     server.enrol("bad", "b", jpeg(1))
     assert server.stop() == 0
-    segment = next((server.data_dir / "maps" / "bad").glob("*.seg"))
-    content = bytearray(segment.read_bytes())
-    content[len(content) // 2] ^= 1
-    segment.write_bytes(content)
+    damage(server.data_dir, "bad")
     server = Server(folder).wait()
     yield server
     assert server.stop() == 0

@@ -16,9 +16,9 @@ from sqlalchemy import update
 from core.errors import StorageFailure
 from core.learning import Witness
 from core.ledger import Statement
-from core.store import Map
 from core.maps import MapSettings
 from core.places import PlaceFields, Pose
+from core.store import Map
 from service.access.audit import ASKER
 from service.app.runtime import Runtime
 from service.engine.engine import Engine

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from core.ledger.maps.counterparts import Counterparts
 from core.maps import Enrolment, MapSettings
-from core.store import Map
 from core.maps.records import LearningSetting
 from core.places import PlaceFields, Pose
+from core.store import Map
 from service.app.runtime import Runtime
 from service.jobs.context import JobCancelled, JobInterrupted
 from service.jobs.job import Job

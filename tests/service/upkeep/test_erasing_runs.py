@@ -14,10 +14,10 @@ from core.belief.evidence import NOTHING
 from core.judgement.trials import StagedTrials, Trial, gathered
 from core.judgement.verdict import Judgement
 from core.learning import RunFrame, Witness
-from core.store import Map
 from core.maps import ReviewSetting
 from core.maps.records import Enrolment
 from core.places import PlaceFields, look_address
+from core.store import Map
 from service.access.audit import ASKER
 from service.app.runtime import Runtime
 from service.jobs.context import creation_time

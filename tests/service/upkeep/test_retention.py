@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from core.errors import NoThumbnail, StorageFailure
-from core.store import Map
 from core.maps import ReviewSetting
 from core.places import look_address
+from core.store import Map
 from service.access.audit import LOGGER
 from service.administration.audit_trail import AuditTrail, audit_trail
 from service.app.runtime import Runtime

@@ -19,7 +19,8 @@ from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.schema import CAMERAS, MAPS, METADATA, PLACES
 from core.maps.counterparts import Correspondence
 from core.places import PlaceFields, Pose
-from tests.core.ledger.maps.memory import MOMENT, MemoryMap
+from core.store import Map
+from tests.core.ledger.maps.conftest import MOMENT
 from tests.core.maps.mixed import both_kinds
 from tests.core.store.frames import frame
 
@@ -28,7 +29,7 @@ LENS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 
 
 @pytest.fixture
-def full(lab: MemoryMap) -> MemoryMap:
+def full(lab: Map) -> Map:
     """Two places and two cameras, with a value in every column of one or the other."""
     lab.cameras.put("front", MASK, LENS, (0, 1023))
     lab.cameras.put("rear", None)
@@ -67,9 +68,9 @@ def change(connection: MapConnection, table: Table, column: str, row: int) -> No
 
 
 @contextmanager
-def changed(lab: MemoryMap, table: Table, column: str, row: int) -> Iterator[MapConnection]:
+def changed(lab: Map, table: Table, column: str, row: int) -> Iterator[MapConnection]:
     """A transaction in which a value is another one; it is undone."""
-    with suppress(_Undone), lab._reading() as connection:
+    with suppress(_Undone), lab._transaction() as connection:
         change(connection, table, column, row)
         yield connection
         raise _Undone
@@ -85,7 +86,7 @@ def cases(table: Table, key: str) -> list[tuple[str, int]]:
     return [(column, row) for column in columns for row in (0, 1)]
 
 
-def test_a_changed_value_of_a_place_is_noticed(full: MemoryMap) -> None:
+def test_a_changed_value_of_a_place_is_noticed(full: Map) -> None:
     for column, row in cases(PLACES, "number"):
         with changed(full, PLACES, column, row) as connection:
             found = places.unsound(connection)
@@ -93,24 +94,24 @@ def test_a_changed_value_of_a_place_is_noticed(full: MemoryMap) -> None:
             if column != "sequence":  # else there is no such sequence, which is noticed in another way
                 with pytest.raises(DamagedRow, match="does not match its checksum"):
                     places.listed_with_looks(connection, -1, 10)
-    with full._reading() as connection:
+    with full._transaction() as connection:
         assert places.unsound(connection) == [] and len(places.listed(connection, -1, 10)) == 2
 
 
-def test_a_changed_value_of_a_camera_is_noticed(full: MemoryMap) -> None:
+def test_a_changed_value_of_a_camera_is_noticed(full: Map) -> None:
     for column, row in cases(CAMERAS, "name"):
         name = ("front", "rear")[row]
         with changed(full, CAMERAS, column, row) as connection:
             assert cameras.unsound(connection) == [name], column
             with pytest.raises(DamagedRow, match=f"camera '{name}' does not match its checksum"):
                 cameras.read_cameras(connection)
-    with full._reading() as connection:
+    with full._transaction() as connection:
         known = cameras.read_cameras(connection)
         assert cameras.unsound(connection) == [] and list(known) == ["front", "rear"]
     assert known["front"].settings() == (MASK, LENS, (0, 1023)) and known["rear"].settings() == (None, None, None)
 
 
-def test_a_changed_record_of_a_map_is_noticed(full: MemoryMap) -> None:
+def test_a_changed_record_of_a_map_is_noticed(full: Map) -> None:
     for column, reason in (
         ("record", "does not match its checksum"),
         ("seal", "does not match its checksum"),
@@ -128,11 +129,11 @@ def test_a_row_is_sound_whatever_its_number_of_the_map_is() -> None:
         assert len(sealed_columns(METADATA.tables[name])) == len(METADATA.tables[name].columns) - 2
 
 
-def test_a_negative_zero_is_a_zero(lab: MemoryMap) -> None:
+def test_a_negative_zero_is_a_zero(lab: Map) -> None:
     """SQLite stores -0.0 as 0.0."""
     lab.enrol([frame("p0", x=-0.0)])
     lab.patch("p0", {"pose": {"x": 1, "y": -0.0, "heading": -0.0}})
-    with lab._reading() as connection:
+    with lab._transaction() as connection:
         assert places.unsound(connection) == []
     lab.set_fields("p0", PlaceFields(pose=Pose(x=-0.0, y=-0.0, z=-0.0)))
     assert lab.place("p0").pose == Pose(x=0, y=0, z=0)

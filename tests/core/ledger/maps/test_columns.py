@@ -13,7 +13,7 @@ from core.ledger.maps.checksums import DamagedRow
 from core.ledger.maps.columns import read_columns
 from core.ledger.maps.schema import PLACES
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, PlaceFields, Pose, microseconds
-from tests.core.ledger.maps.memory import MemoryMap
+from core.store import Map
 from tests.core.maps.mixed import both_kinds
 from tests.core.store.frames import frame
 
@@ -30,16 +30,15 @@ KINDS = {"metric": METRIC, "geographic": GEOGRAPHIC}
 
 
 @pytest.mark.parametrize("at_once", [2, 65_536])
-def test_columns_are_the_fields_of_the_places(lab: MemoryMap, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_columns_are_the_fields_of_the_places(lab: Map, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(columns, "_AT_ONCE", at_once)
     with both_kinds():
         lab.enrol([replace(frame(f"p{i}"), fields=fields) for i, fields in enumerate(FIELDS)])
     lab.forget("p0")
-    with lab._reading() as connection:
+    with lab._transaction() as connection:
         found = read_columns(connection, 5)
     order = np.argsort(found.rows)
     assert found.rows[order].tolist() == [1, 2, 3, 4]
-    assert found.checksums[order].tolist() == [2, 3, 4, 5]
     there = found.whereabouts.take(order)
     assert there.sequence.tolist() == [0, 1, 0, NO_SEQUENCE] and there.ordinal.tolist() == [0, 0, 1, 1]
     assert (there.track.tolist(), there.station.tolist()) == (there.sequence.tolist(), there.ordinal.tolist())
@@ -52,8 +51,8 @@ def test_columns_are_the_fields_of_the_places(lab: MemoryMap, at_once: int, monk
         np.testing.assert_array_equal(there.heading[at], np.float32(np.nan if pose.heading is None else pose.heading))
 
 
-def test_of_an_empty_map(lab: MemoryMap) -> None:
-    with lab._reading() as connection:
+def test_of_an_empty_map(lab: Map) -> None:
+    with lab._transaction() as connection:
         found = read_columns(connection, 0)
     assert (len(found.rows), len(found.whereabouts), found.whereabouts.position.shape) == (0, 0, (0, 3))
 
@@ -63,7 +62,7 @@ def test_of_an_empty_map(lab: MemoryMap) -> None:
     [("x", None, ValueError), ("latitude", 3.5, ValueError), ("row", 77, DamagedRow)],
 )
 def test_values_that_no_place_has_are_damage(
-    lab: MemoryMap, column: str, value: float | None, error: type[Exception]
+    lab: Map, column: str, value: float | None, error: type[Exception]
 ) -> None:
     lab.enrol([frame("p0", x=1.0), frame("p1", x=2.0)])
     spoil = Statement(
@@ -71,7 +70,7 @@ def test_values_that_no_place_has_are_damage(
         .where(PLACES.c.map == bindparam("map"), PLACES.c.id == bindparam("which"))
         .values({column: bindparam("value")})
     )
-    with lab._reading() as connection:
+    with lab._transaction() as connection:
         connection.change(spoil, which="p1", value=value)
         with pytest.raises(error):
             read_columns(connection, 2)

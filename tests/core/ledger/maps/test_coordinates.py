@@ -7,17 +7,18 @@ import pytest
 from core.errors import MixedCoordinates
 from core.maps import SameFrame
 from core.places import PlaceFields, Pose
-from tests.core.ledger.maps.memory import MemoryMap
+from core.store import Map, Store
+from tests.core.ledger.maps.conftest import content
 from tests.core.maps.mixed import POSES, both_kinds, posed
-from tests.core.store.frames import digest_of, frame
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
 
 METRES, DEGREES = POSES
 
 
 @pytest.mark.parametrize(("first", "second"), [(METRES, DEGREES), (DEGREES, METRES)], ids=["degrees", "metres"])
-def test_the_other_kind_is_refused_however_it_comes(lab: MemoryMap, first: Pose, second: Pose) -> None:
+def test_the_other_kind_is_refused_however_it_comes(lab: Map, first: Pose, second: Pose) -> None:
     lab.enrol([posed("p0", first), posed("p1", None), posed("p2", first)])
-    before = lab.content()
+    before = content(lab)
     for write in (
         lambda: lab.enrol([posed("new", second)]),
         lambda: lab.enrol([posed("fine", first), posed("new", second)]),
@@ -29,10 +30,10 @@ def test_the_other_kind_is_refused_however_it_comes(lab: MemoryMap, first: Pose,
     ):
         with pytest.raises(MixedCoordinates, match=r"metric coordinates \(x and y.* geographic|geographic.* metric"):
             write()
-        assert lab.content() == before
+        assert content(lab) == before
 
 
-def test_an_item_of_the_other_kind_fails_alone_where_that_is_wanted(lab: MemoryMap) -> None:
+def test_an_item_of_the_other_kind_fails_alone_where_that_is_wanted(lab: Map) -> None:
     rejected: list[int] = []
     items = [posed("p0", METRES), posed("p1", DEGREES), posed("p2", None), posed("p3", METRES), posed("p4", DEGREES)]
     found = lab.enrol(items, lambda position, error: rejected.append(position))
@@ -40,7 +41,7 @@ def test_an_item_of_the_other_kind_fails_alone_where_that_is_wanted(lab: MemoryM
     assert [place.id for place in lab.places(None, 9)[0]] == ["p0", "p2", "p3"]
 
 
-def test_a_place_may_change_its_kind_where_no_other_has_a_pose(lab: MemoryMap) -> None:
+def test_a_place_may_change_its_kind_where_no_other_has_a_pose(lab: Map) -> None:
     lab.enrol([posed("p0", METRES), posed("p1", None)])
     lab.enrol([posed("p0", METRES), posed("p0", DEGREES), posed("p1", DEGREES)])
     with pytest.raises(MixedCoordinates):
@@ -51,13 +52,13 @@ def test_a_place_may_change_its_kind_where_no_other_has_a_pose(lab: MemoryMap) -
     lab.enrol([posed("p0", DEGREES)])
 
 
-def test_what_changes_within_a_write_counts(lab: MemoryMap) -> None:
+def test_what_changes_within_a_write_counts(lab: Map) -> None:
     lab.enrol([posed("p0", METRES)])
     with pytest.raises(MixedCoordinates):
         lab.enrol([posed("p0", METRES), posed("p0", DEGREES), posed("p2", METRES)])
 
 
-def test_a_map_of_old_that_has_both_kinds_takes_both(lab: MemoryMap) -> None:
+def test_a_map_of_old_that_has_both_kinds_takes_both(lab: Map) -> None:
     with both_kinds():
         lab.enrol([posed("p0", METRES), posed("p1", DEGREES)])
     lab.enrol([posed("p2", METRES), posed("p3", DEGREES)])
@@ -67,7 +68,6 @@ def test_a_map_of_old_that_has_both_kinds_takes_both(lab: MemoryMap) -> None:
     }  # fmt: skip
 
 
-def test_maps_without_poses_and_other_maps_do_not_count(lab: MemoryMap) -> None:
-    with MemoryMap(lab.ledger, "yard")._writing() as write:
-        write.enrol(posed("p0", DEGREES))
+def test_maps_without_poses_and_other_maps_do_not_count(store: Store, lab: Map) -> None:
+    store.create("yard", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([posed("p0", DEGREES)])
     lab.enrol([frame("p0"), posed("p1", METRES)])

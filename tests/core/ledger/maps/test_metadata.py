@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import bindparam, delete, insert
 
-from core.ledger import Ledger, Statement
+from core.ledger import Statement
 from core.ledger.maps import places
 from core.ledger.maps.connection import MapConnection
 from core.ledger.maps.places import LONGEST_TEXT, token_of
@@ -20,8 +20,8 @@ from core.ledger.postgres import PostgresConnection
 from core.ledger.sqlite import SqliteConnection
 from core.maps.place_filter import PlaceFilter, Scalar
 from core.places import PlaceFields
-from tests.core.ledger.maps.memory import MemoryMap
-from tests.core.store.frames import frame
+from core.store import Map, Store
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 scalars = st.one_of(
     st.none(),
@@ -39,7 +39,7 @@ def equal(a: Any, b: Any) -> bool:
     return a == b and isinstance(a, bool) == isinstance(b, bool) and (a is None) == (b is None)
 
 
-def by_walking(lab: MemoryMap, where: dict[str, Scalar]) -> list[str]:
+def by_walking(lab: Map, where: dict[str, Scalar]) -> list[str]:
     found, _ = lab.places(None, 1000)
     return sorted(
         place.id
@@ -48,12 +48,12 @@ def by_walking(lab: MemoryMap, where: dict[str, Scalar]) -> list[str]:
     )
 
 
-def rows_with(lab: MemoryMap, where: dict[str, Scalar], rows: Any = None) -> list[int]:
-    with lab._reading() as connection:
+def rows_with(lab: Map, where: dict[str, Scalar], rows: Any = None) -> list[int]:
+    with lab._transaction() as connection:
         return places.rows_with(connection, where, rows).tolist()
 
 
-def by_index(lab: MemoryMap, where: dict[str, Scalar]) -> list[str]:
+def by_index(lab: Map, where: dict[str, Scalar]) -> list[str]:
     rows = rows_with(lab, where)
     assert rows == sorted(rows)
     return sorted(place.id for place in lab.places_at(rows) if place is not None)
@@ -66,9 +66,9 @@ def by_index(lab: MemoryMap, where: dict[str, Scalar]) -> list[str]:
     st.dictionaries(st.sampled_from(["floor", "light", "ä b", "other"]), scalars, min_size=1, max_size=2),
 )
 def test_whatever_was_written(
-    ledger: Ledger, monkeypatch: pytest.MonkeyPatch, steps: list[tuple[int, str, dict[str, Any]]], where: Any
+    store: Store, monkeypatch: pytest.MonkeyPatch, steps: list[tuple[int, str, dict[str, Any]]], where: Any
 ) -> None:
-    lab = MemoryMap(ledger, f"lab-{secrets.token_hex(8)}")
+    lab = store.create(f"lab-{secrets.token_hex(8)}", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     try:
         for count, (number, action, metadata) in enumerate(steps):
             place_id = f"p{number}"
@@ -85,13 +85,13 @@ def test_whatever_was_written(
         for few in (0, 5000):  # read all rows with a value, or look some up one by one
             monkeypatch.setattr(places, "FEW", few)
             assert rows_with(lab, where, some) == np.intersect1d(every, some).tolist()
-        with lab._reading() as connection:
+        with lab._transaction() as connection:
             assert places.stale_tokens(connection) == []
     finally:
         monkeypatch.undo()
 
 
-def test_kinds_of_values(lab: MemoryMap) -> None:
+def test_kinds_of_values(lab: Map) -> None:
     values: list[Any] = [1, 1.0, True, "1", None, 0, False, "", 10**30, [1], {"a": 1}, "x" * (LONGEST_TEXT + 1)]
     lab.enrol([frame(f"p{i}", metadata={"v": value}) for i, value in enumerate(values)])
     expected: list[tuple[Scalar, list[str]]] = [
@@ -103,7 +103,7 @@ def test_kinds_of_values(lab: MemoryMap) -> None:
     assert by_index(lab, {"w": None}) == []
 
 
-def test_values_of_other_maps_and_of_places_that_are_gone_are_not_found(lab: MemoryMap) -> None:
+def test_values_of_other_maps_and_of_places_that_are_gone_are_not_found(lab: Map) -> None:
     assert by_index(lab, {"v": 1}) == []  # as the places of the other map have
     lab.enrol([frame(f"q{i}", metadata={"v": 1}, sequence="monday" if i % 2 else "tuesday") for i in range(6)])
     lab.forget_sequence("monday")
@@ -118,9 +118,9 @@ PUT = Statement(insert(TOKENS).values({name: bindparam(name) for name in ("map",
 DELETE = Statement(delete(TOKENS).where(TOKENS.c.map == bindparam("map"), TOKENS.c.row == bindparam("which")))
 
 
-def test_an_index_that_is_wrong_is_noticed_and_made_again(lab: MemoryMap) -> None:
+def test_an_index_that_is_wrong_is_noticed_and_made_again(lab: Map) -> None:
     lab.enrol([frame(f"q{i}", metadata={"floor": i, "note": "a"}) for i in range(3)])
-    with lab._reading() as connection:
+    with lab._transaction() as connection:
         assert places.stale_tokens(connection) == []
         connection.execute(PUT, token=token_of("floor", 7), row=1)
         connection.execute(DELETE, which=2)

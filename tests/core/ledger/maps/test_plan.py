@@ -6,27 +6,27 @@ import json
 from datetime import UTC, datetime
 from typing import Any
 
-from core.maps.counterparts import Correspondence
 from core.ledger.maps.plan import HANDED_OVER, HAS_PICTURE
+from core.maps.counterparts import Correspondence
 from core.places import PlaceFields, Pose
-from tests.core.ledger.maps.memory import MemoryMap
+from core.store import Map
 from tests.core.maps.mixed import both_kinds
 from tests.core.store.frames import frame
 
 
-def plan_of(lab: MemoryMap, step: int = 1) -> dict[str, Any]:
+def plan_of(lab: Map, step: int = 1) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(f"{{{lab.plan.columns(step)}}}")
     return found
 
 
-def test_of_an_empty_map(lab: MemoryMap) -> None:
+def test_of_an_empty_map(lab: Map) -> None:
     assert plan_of(lab) == {
         "sequences": [], "ids": [], "sequence": [], "x": None, "y": None, "z": None, "latitude": None,
         "longitude": None, "heading": None, "timestamp": None, "flags": [],
     }  # fmt: skip
 
 
-def test_the_columns_are_those_of_the_places(lab: MemoryMap) -> None:
+def test_the_columns_are_those_of_the_places(lab: Map) -> None:
     moment = datetime(2026, 11, 20, 10, 0, 0, 125_499, tzinfo=UTC)
     before = datetime(1969, 12, 31, 23, 59, 59, 999_000, tzinfo=UTC)
     lab.enrol([frame("p0", sequence="tuesday", timestamp=moment), frame("p1", sequence="Ünter")])

@@ -1,4 +1,4 @@
-"""Maps are made, found, listed, published and deleted by their rows, in either database."""
+"""Maps are made, found, listed, published and deleted by their rows in a database of many maps."""
 
 from __future__ import annotations
 
@@ -7,19 +7,30 @@ from collections.abc import Iterator
 import pytest
 
 from core.errors import MapExists, UnknownMap
-from core.ledger import Ledger
 from core.ledger.database import LedgerConnection
 from core.ledger.maps import record, sequences
 from core.ledger.maps.connection import MapConnection
-from core.ledger.postgres import PostgresConnection
-from tests.core.ledger.maps.memory import MemoryMap, record_of
-from tests.core.store.frames import frame
+from core.maps import MapRecord
+from core.maps.forms import HALF
+from core.store import Map, Store
+from core.store.cluster import Cluster
+from tests.core.ledger.maps.conftest import content
+from tests.core.store.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+
+pytestmark = pytest.mark.parametrize(
+    "database", [pytest.param("postgresql", marks=pytest.mark.postgres)], indirect=True
+)
+
+
+def record_of(name: str) -> MapRecord:
+    return MapRecord.new(name, ENCODER, DIMENSION, LOCAL_SHAPE, HALF, None)
 
 
 @pytest.fixture
-def whole(ledger: Ledger) -> Iterator[LedgerConnection]:
-    """A connection to a ledger in which there is the map "hall", in one transaction of the test."""
-    with ledger.transaction("test") as connection:
+def whole(store: Store) -> Iterator[LedgerConnection]:
+    """A connection to a database in which there is the map "hall", in one transaction of the test."""
+    assert isinstance(store, Cluster)
+    with store.database.transaction("test") as connection:
         yield connection
 
 
@@ -28,7 +39,8 @@ def names(connection: LedgerConnection) -> list[str]:
 
 
 def test_an_id_is_of_one_map(whole: LedgerConnection) -> None:
-    number = record.create(whole, record_of("lab"))
+    made = record_of("lab")
+    number = record.create(whole, made)
     assert record.find(whole, "lab").number == number and names(whole) == ["hall", "lab"]
     assert record.find(whole, "hall").number != number
     with pytest.raises(MapExists, match="There is already a map 'lab'"):
@@ -39,7 +51,7 @@ def test_an_id_is_of_one_map(whole: LedgerConnection) -> None:
     assert [one.id for one in record.records_after(whole, "hall", 10)] == ["lab"]
     assert [one.id for one in record.records_after(whole, "", 1)] == ["hall"]
     of_lab = MapConnection(whole, number)
-    assert record.state_of(of_lab, "lab", locked=True).record == record_of("lab")
+    assert record.state_of(of_lab, "lab", locked=True).record == made
     assert sequences.ends(of_lab) == {None: 0}
 
 
@@ -61,20 +73,12 @@ def test_a_map_that_is_built_is_listed_when_it_is_published(whole: LedgerConnect
         record.publish(whole, number, "lab")
 
 
-def test_a_changed_record_is_read_as_it_was_stored(lab: MemoryMap) -> None:
-    made = lab.edit({"description": "of the Ünter den Linden", "same_place_radius": 7.5})
-    assert lab.record == made and made.revision == 2
-    with pytest.raises(UnknownMap), lab.ledger.transaction("look") as connection:
-        record.state_of(MapConnection(connection, 99), "nobody")
-
-
-def test_a_map_takes_all_of_its_rows_with_it(lab: MemoryMap) -> None:
+def test_a_map_takes_all_of_its_rows_with_it(lab: Map) -> None:
     lab.enrol([frame("p0", sequence="s", metadata={"floor": 1})])
     lab.cameras.put("front", None)
-    with lab._reading() as connection:
-        if not isinstance(connection.whole, PostgresConnection):
-            pytest.skip("the only map of an SQLite file goes with the file")
+    with lab._transaction() as connection:
         record.delete_map(connection)
         with pytest.raises(UnknownMap):
             record.state_of(connection, "lab")
-    assert not any(lab.content().values())
+    with pytest.raises(UnknownMap):
+        content(lab)

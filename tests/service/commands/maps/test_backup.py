@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.core.storage.archives.files import parts_of
+from tests.core.store.archives.files import parts_of
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import jpeg
 from tests.service.server import Server
