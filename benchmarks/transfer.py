@@ -19,7 +19,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from core.storage.archives.building import build
 
 from benchmarks.process import peak_memory
 from benchmarks.report import report

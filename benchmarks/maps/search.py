@@ -29,7 +29,6 @@ import faiss
 import numpy as np
 import torch
 import typer
-from core.storage.files.segment_files import Layout
 from numpy.typing import NDArray
 from rich.progress import Progress
 

@@ -17,13 +17,13 @@ from dataclasses import replace
 import faiss
 import numpy as np
 import typer
-from core.storage.files.segment_files import ROWS_PER_SEGMENT
 from numpy.typing import NDArray
 
 from benchmarks.report import report
 from core.index import Coder, CodeTable
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.places import NO_POSE
+from core.store.following import ROWS_PER_SEGMENT
 from core.store.segment import Location
 from core.store.snapshot import Snapshot
 from core.threads import share_cores
