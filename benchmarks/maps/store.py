@@ -70,7 +70,8 @@ def query(map_: Map, descriptor: Array) -> bool:
     scope.snapshot.whereabouts_at(rows[:100])
     map_.places_at(rows[:10].tolist())
     map_.keypoints_at(rows[:20].tolist())
-    return bool(map_.glances_at(rows[:60].tolist()))
+    map_.glances_at(rows[:60].tolist())
+    return len(rows) > 0
 
 
 def milliseconds(work: Callable[[int], object], count: int) -> float:
