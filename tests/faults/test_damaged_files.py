@@ -57,6 +57,7 @@ def make_map(atlas: Directory, name: str) -> Map:
     made.enrol([large := pictured(frame(f"{name}3", "again"), 45_000)])  # takes pages of its own
     made.set_fields(f"{name}4", made.place(f"{name}4").model_copy(update={"camera": "left"}))
     made.forget(f"{name}5")
+    assert large.image is not None
     for asked in (b"doubtful", large.image[::-1]):
         assert made.review.keep(asked, {"verdict": "unknown"}, ReviewSetting())
     return made

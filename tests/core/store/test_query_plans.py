@@ -49,7 +49,7 @@ ACTIONS: dict[str, Callable[[Map], object]] = {
     "a scope": lambda lab: lab.scope(Selection(Conditions(sequences=("s",), metadata={"floor": 1}), recent=LAST)),
     "descriptors": lambda lab: Rows(lab._glancing, Form.of(lab.record), RowCache()).descriptors(np.array([1, 2])),
     "followed": lambda lab: lab.enrol([frame("next")]) and lab.snapshot(),
-    "cleared": lambda lab: (lab.forget("p8"), lab.edit({"description": "cleared"})),
+    "cleared": lambda lab: lab.transfer.forget({"p8": frame("p8").digest}) and lab.edit({"description": "cleared"}),
     "a frame for review": lambda lab: lab.review.keep(b"frame", {}, ReviewSetting()),
     "frames for review": lambda lab: lab.review.page(None, 5),
     "cameras": lambda lab: lab.cameras.put("front", None),
