@@ -215,7 +215,7 @@ class DataDirectoryTooNew(PlacerecError):
 
 
 class DataDirectoryTooOld(PlacerecError):
-    """The data was written before the first release of placerec, in a form that is not read."""
+    """The data was written by an earlier version of placerec, in a form that is not read."""
 
 
 # Runs

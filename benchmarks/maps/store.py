@@ -94,9 +94,7 @@ def measured(folder: Path, places: int) -> dict[str, float]:
     milliseconds(lambda at: query(map_, queries[at]), 20)
     one = milliseconds(lambda at: query(map_, queries[at]), QUERIES)
     with ThreadPoolExecutor(ROBOTS) as pool:
-        began = time.perf_counter()
-        list(pool.map(lambda one: query(map_, one), ROBOTS * queries))
-        many = 1e3 * (time.perf_counter() - began) / (ROBOTS * QUERIES)
+        many = milliseconds(lambda _: list(pool.map(lambda of: query(map_, of), ROBOTS * queries)), 1)
     both = milliseconds(lambda at: map_.enrol([frames.enrolment(2 * 10**6 + at)]) and query(map_, queries[at]), ALONE)
     atlas.close()
     openings: dict[bool, list[float]] = {True: [], False: []}
@@ -112,7 +110,7 @@ def measured(folder: Path, places: int) -> dict[str, float]:
         "enrolled alone, ms": alone,
         f"enrolled in {BATCH}s, ms a place": together,
         "query, ms": one,
-        f"query by {ROBOTS} threads, ms each": many,
+        f"query by {ROBOTS} threads, ms each": many / (ROBOTS * QUERIES),
         "enrolled and queried, ms": both,
         "opened and queried, cold, ms": min(openings[True]),
         "opened and queried, warm, ms": min(openings[False]),

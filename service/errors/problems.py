@@ -148,7 +148,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.MapQuarantined: Kind(503, "map-quarantined", "The map is damaged and out of service"),
     errors.DataDirectoryLocked: Kind(503, "data-directory-locked", "Another process uses the data directory"),
     errors.DataDirectoryTooNew: Kind(503, "data-directory-too-new", "The data was written by a later version"),
-    errors.DataDirectoryTooOld: Kind(503, "data-directory-too-old", "The data was written before the first release"),
+    errors.DataDirectoryTooOld: Kind(503, "data-directory-too-old", "The data was written by an earlier version"),
     # Maps as files
     errors.InvalidArchive: Kind(422, "invalid-archive", "The file is not a valid export of a map"),
     errors.ArchiveTooNew: Kind(422, "archive-too-new", "The file was written by a later version"),

@@ -426,7 +426,7 @@ class DataDirectoryTooNew(Problem):
 
 
 class DataDirectoryTooOld(Problem):
-    """503 ``data-directory-too-old``: The data was written before the first release."""
+    """503 ``data-directory-too-old``: The data was written by an earlier version."""
 
 
 class DeadlineExceededByService(Problem, errors.DeadlineExceeded):
