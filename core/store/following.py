@@ -9,7 +9,6 @@ cached rows included, and reads it anew.
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import logging
 import threading
@@ -103,8 +102,6 @@ class FollowedMap:
     def has_older_readers(self) -> bool:
         """Whether a snapshot is in use that shows another state of the map than the last one."""
         now = None if self._held is None else self._held.snapshot
-        if any(one is not now for one in self._given):
-            gc.collect()  # one in a circle of objects, as a traceback makes it, is in use by nobody
         return any(one is not now for one in self._given)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 import time
@@ -11,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from core.disk.files import Damage
-from core.errors import MapBusy, MapQuarantined, PlacerecError, StorageFailure, UnknownMap
+from core.errors import MapBusy, MapQuarantined, PlacerecError, StorageFailure, StorageFull, UnknownMap
 from core.geometry.keypoints import Keypoints, keypoints_of
 from core.index import Coder
 from core.ledger.maps import frames, places, record, rows
@@ -49,6 +50,9 @@ if TYPE_CHECKING:
     from core.index.milvus import Milvus
 
 log = logging.getLogger(__name__)
+
+TIDIED_AT_ONCE = 16
+"""Times that a write deletes some of what no place names any more."""
 
 MOST_RECENT = 1024
 """Places of a map that are remembered after they were read …"""
@@ -361,27 +365,26 @@ class Map(LedgerMap):
         Raises:
             MapBusy: what was deleted is still being read; try again.
         """
-        end, total = time.monotonic() + rows.LEFT_SECONDS + 60, self._uncleared()
-        if self.is_open:
-            self.snapshot()  # older ones, which may need what was deleted, are then known
-        while left := self._uncleared():
+        end, total = time.monotonic() + rows.LEFT_SECONDS + 60, self._left()[1]
+        while left := self._left()[0]:
             progress(total - min(left, total), total)
             if time.monotonic() > end:
                 raise MapBusy("What was deleted is still being read: erase it later.")
-            known = not self.database.shared and not self._followed.has_older_readers
-            if not self._tidy(at_once=known):
+            if not self._tidy(at_once=self._is_unread()):
+                gc.collect()  # a snapshot in a circle of objects, as a traceback makes it, is in use by nobody
                 threading.Event().wait(0.05 if not self.database.shared else 1)
         with self._guarded():
             freed = self.database.erase()
-        with self._reading() as connection:
+        with self._transaction() as connection:
             dead = rows.dead_since(connection, -1)
+            rows.note_erased(connection)
         self._followed.erase(self.record, dead)
         self._room = None
         return ErasureReport(rows=total, bytes=freed)
 
-    def _uncleared(self) -> int:
+    def _left(self) -> tuple[int, int]:
         with self._reading() as connection:
-            return rows.uncleared(connection)
+            return rows.left(connection)
 
     def storage_status(self) -> StorageStatus:
         """How much room the map takes."""
@@ -429,21 +432,43 @@ class Map(LedgerMap):
     @contextmanager
     def _writing(self) -> Iterator[Write]:
         """One write, which is stored whole at the end of the block, or not at all."""
-        with self._transaction() as connection:
-            state = record.state_of(connection, self.record.id, locked=True)
-            write = Write(connection, replace(state, posed=self._posed))
-            yield write
-            write.finish()
+        try:
+            with self._transaction() as connection:
+                state = record.state_of(connection, self.record.id, locked=True)
+                write = Write(connection, replace(state, posed=self._posed))
+                yield write
+                write.finish()
+        except StorageFull:
+            self._try_to_tidy(True)  # which makes room for another try
+            raise
         self._posed = write.state.posed
         self.note(write.state)
-        try:
-            self._tidy()
-        except PlacerecError as error:
-            log.warning("Map %s: %s", self.record.id, error)
+        self._try_to_tidy(write.leaves)
 
     writing = _writing
 
-    def _tidy(self, at_once: bool = False) -> int:
-        """Delete what no place names any more; what cannot be deleted now is deleted after another write."""
+    def _try_to_tidy(self, fresh: bool) -> None:
+        """Delete some of what no place names any more; what cannot be deleted now is deleted after another write.
+
+        Args:
+            fresh: also what died a moment ago, if it is known that nobody needs it.
+        """
+        try:
+            known = fresh and self._is_unread()
+            for _ in range(TIDIED_AT_ONCE):
+                if not self._tidy(known):
+                    break
+        except PlacerecError as error:
+            log.warning("Map %s: %s", self.record.id, error)
+
+    def _is_unread(self) -> bool:
+        """Whether it is known that nobody searches the map as it was before its last write."""
+        if self.database.shared:
+            return False
+        if self.is_open:
+            self.snapshot()  # older ones, which may need what was deleted, are then known
+        return not self._followed.has_older_readers
+
+    def _tidy(self, at_once: bool) -> int:
         with self._transaction() as connection:
             return rows.clear(connection, at_once)

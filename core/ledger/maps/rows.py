@@ -29,8 +29,11 @@ LEFT_SECONDS = 60
 REMEMBERED_SECONDS = 7 * 24 * 3600
 """How long it is remembered which rows died, so that a service need not read a whole map again."""
 
-CLEARED_AT_ONCE = 256
-"""Rows that a write deletes behind itself at most."""
+CLEARED_AT_ONCE = 16
+"""Rows that are deleted with one COMMIT, whose log needs as much room as they had."""
+
+ERASED = 2
+"""Of the column ``cleared``: nothing is left on the disk."""
 
 _TABLES: dict[Kind, Table] = {"descriptors": DESCRIPTORS, "locals": LOCALS, "codes": CODES}
 _SUM_BYTES = 4
@@ -99,10 +102,15 @@ _OLD = Statement(
     .limit(bindparam("most"))
     .with_for_update(skip_locked=True)
 )
-_UNCLEARED = Statement(select(func.count()).where(_of_map(DEAD_ROWS), _R.cleared == 0, ~_HAS_PLACE))
+_COUNTS = Statement(
+    select(func.count().filter(_R.cleared == 0), func.count().filter(_R.cleared < ERASED)).where(
+        _of_map(DEAD_ROWS), ~_HAS_PLACE
+    )
+)
+_NOTE_ERASED = Statement(update(DEAD_ROWS).where(_of_map(DEAD_ROWS), _R.cleared == 1).values(cleared=ERASED))
 _CLEAR = Statement(update(DEAD_ROWS).where(_of_map(DEAD_ROWS), among(_R.number, "rows")).values(cleared=1))
 _FORGET = Statement(
-    delete(DEAD_ROWS).where(_of_map(DEAD_ROWS), _R.cleared == 1, _R.since < seconds_now() - bindparam("age"))
+    delete(DEAD_ROWS).where(_of_map(DEAD_ROWS), _R.cleared > 0, _R.since < seconds_now() - bindparam("age"))
 )
 _NOTE_REVISION = Statement(
     lambda insert: insert(REVISIONS).values(
@@ -209,9 +217,15 @@ def clear(connection: MapConnection, at_once: bool = False) -> int:
     return len(rows)
 
 
-def uncleared(connection: MapConnection) -> int:
-    """How many rows have died of which something is stored yet."""
-    return int(connection.execute(_UNCLEARED)[0][0])
+def left(connection: MapConnection) -> tuple[int, int]:
+    """How many rows have died of which something is stored yet, and of which something may be left on the disk."""
+    ((uncleared, unerased),) = connection.execute(_COUNTS)
+    return int(uncleared), int(unerased)
+
+
+def note_erased(connection: MapConnection) -> None:
+    """Note that nothing is left of rows that were deleted."""
+    connection.execute(_NOTE_ERASED)
 
 
 def dead_since(connection: MapConnection, revision: int) -> list[int]:

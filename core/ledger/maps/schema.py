@@ -153,7 +153,7 @@ KEYPOINTS = _table(
 )  # fmt: skip
 
 # Rows that no place has any more, and the revision of the map since which that is so.  What is stored of them is
-# deleted a while later, for a query may still need it; then ``cleared`` is 1.
+# deleted a while later, for a query may still need it; then ``cleared`` is 1, and 2 when nothing is left on the disk.
 DEAD_ROWS = _table(
     "dead_rows", ("number",), _column("number", integer()), _column("revision", integer()), _column("since", real()),
     _column("cleared", integer(), server_default="0"), clustered=True,

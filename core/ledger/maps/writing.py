@@ -48,10 +48,11 @@ class Write:
 
     state: of the map, with the changes so far.
     changed: whether anything was changed, the counters apart.
+    leaves: whether a row is no place's any more.
     """
 
     def __init__(self, connection: MapConnection, state: MapState) -> None:
-        self._connection, self.state, self.changed = connection, state, False
+        self._connection, self.state, self.changed, self.leaves = connection, state, False, False
         self._form = Form.of(state.record)
         self._new: dict[int, tuple[bytes, bytes]] = {}  # descriptor and local descriptors by row, in stored form
         self._before = state
@@ -300,7 +301,7 @@ class Write:
 
     def _leave(self, stored: StoredPlace) -> None:
         """Note that the row of a place, as it was, is no place's any more."""
-        self.changed = True
+        self.changed = self.leaves = True
         rows.leave(self.connection, stored.row, self._revision)
 
     def _position(self, sequence: str | None, look: ViewedFrame) -> int | None:

@@ -279,7 +279,7 @@ class StoreContract(RuleBasedStateMachine):
         with patch.object(rows, "LEFT_SECONDS", -1):
             self.map.erase()
         with self.map.viewing() as (connection, _):
-            assert rows.uncleared(connection) == 0 and rows.of_no_place(connection) == []
+            assert rows.left(connection)[0] == 0 and rows.of_no_place(connection) == []
 
     @rule(place_id=ids, picture=pictures, given=fields, ordinal=st.none() | st.integers(0, 9))
     def adopt(self, place_id: str, picture: str, given: dict[str, Any], ordinal: int | None) -> None:

@@ -78,6 +78,7 @@ def found(directory: Path, place_id: str) -> set[str]:
 def pictures(atlas: Directory) -> Map:
     """Forty places with whole images."""
     made = atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
+    made.edit({"index": "compact"})  # with codes, too
     made.enrol([pictured(f"p{i}", sequence="monday" if i % 4 else "tuesday") for i in range(40)])
     return made
 
