@@ -232,8 +232,9 @@ class MapFile:
                     if driver.in_transaction:
                         driver.execute("ROLLBACK")
                 # A COMMIT that found no room has not written the end of its transaction.
-                if committing and not (isinstance(error, sqlite3.Error) and is_full(error)):
-                    self._doubtful = True
+                found_no_room = isinstance(error, sqlite3.Error) and is_full(error)
+                self._doubtful |= committing and not found_no_room
+                if self._doubtful or found_no_room:  # the log takes up room, too
                     with suppress(OSError, sqlite3.Error):
                         self._empty_log(driver)
                 raise

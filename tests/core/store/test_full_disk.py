@@ -115,6 +115,9 @@ def test_deleting_a_sequence_makes_room(small_disk: Path) -> None:
     lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
     for name in ("monday", "tuesday"):
         lab.enrol([frame(f"{name}{i}", dimension=LARGE, sequence=name) for i in range(48)])
+    atlas.close()
+    atlas = Directory(small_disk / "data", rows_per_segment=8)
+    lab = atlas.get("lab")
     more = [frame(f"new{i}", dimension=LARGE) for i in range(40)]
     reserve = Reserve(small_disk, 2_000_000)  # a deletion needs a little, too
     assert reserve.hold()
@@ -137,7 +140,9 @@ def test_a_write_stays_acknowledged_when_what_is_deleted_behind_it_finds_no_room
     atlas = Directory(small_disk / "data", rows_per_segment=8)
     lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     lab.enrol([large_frame(f"p{i}", LARGE, 30_000) for i in range(12)])
+    searched = lab.snapshot()
     assert lab.forget_all(PlaceFilter(ids=tuple(f"p{i}" for i in range(8))), 100)
+    assert lab._left()[0] == 8 and len(searched) == 12
     monkeypatch.setattr(rows, "LEFT_SECONDS", 0)
     clear = rows.clear
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from core.errors import MapQuarantined
-from core.index import Coder
 from core.index.flat import vectors
 from core.ledger.maps import rows
 from core.maps import MapSettings
@@ -38,8 +37,8 @@ def test_a_good_map(hall: Map) -> None:
     report = hall.verify()
     assert (report.ok, report.places, report.rows) == (True, 9, 10)
     assert (report.problems, report.stale_caches) == ([], [])
-    form, code = Form.of(hall.record).frame.itemsize, Coder.of(DIMENSION).bytes_per_place
-    assert report.checked_bytes == 9 * (form + code + len("image 0"))
+    form = Form.of(hall.record).frame.itemsize
+    assert report.checked_bytes == 9 * (form + len("image 0"))
 
 
 @pytest.mark.parametrize("table", ["descriptors", "locals"])
