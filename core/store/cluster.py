@@ -109,6 +109,9 @@ class MapRows:
         """None: PostgreSQL knows."""
         return
 
+    def give_back(self) -> None:
+        """Do nothing: PostgreSQL's disk is its own."""
+
     def erase(self) -> int:
         """Have PostgreSQL use the room of deleted rows again; 0, for its files stay as large."""
         with self._database.connection("vacuum", LONG_SECONDS) as connection:

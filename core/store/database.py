@@ -46,6 +46,9 @@ class MapDatabase(Protocol):
     def room(self) -> int | None:
         """The bytes that the map takes on the disk; None where only a server knows."""
 
+    def give_back(self) -> None:
+        """Give the disk room that deletions have freed, where it has little left."""
+
     def erase(self) -> int:
         """Have nothing left on the disk of what was deleted; returns the bytes by which it got smaller.
 

@@ -6,6 +6,7 @@ the log is synced; SQLite also syncs the folder when it creates the log.
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 import threading
 from collections import OrderedDict
@@ -30,6 +31,10 @@ from core.store.database import Closed
 
 FILE = "map.sqlite"
 
+SCARCE_BYTES = 256 << 20
+"""Where the disk has less room than this, files are made smaller when something was deleted from them."""
+
+_PAGES_AT_ONCE = 128
 _IDLE_READERS = 4
 _LOG_BYTES = 64 << 20  # a log that a large batch made longer is cut to this size
 _SETTINGS = {
@@ -323,6 +328,20 @@ class MapFile:
             except sqlite3.OperationalError as error:
                 raise MapBusy("The map is being read, by an export or a check: erase it later.") from error
             return max(0, before - self.path.stat().st_size)
+
+    def give_back(self) -> None:
+        """Make the file smaller by what was deleted from it, and empty the log, where the disk has little room left."""
+        if shutil.disk_usage(self.folder).free >= SCARCE_BYTES:
+            return
+        with self._lock, self._used(), disk_errors(f"make map {self.folder.name!r} smaller", FILE):
+            if (driver := self._writer) is None:  # it was closed meanwhile
+                return
+            before = -1
+            self._empty_log(driver)
+            while (left := driver.execute("PRAGMA freelist_count").fetchone()[0]) not in (0, before):
+                driver.executescript(f"PRAGMA incremental_vacuum({_PAGES_AT_ONCE})")  # execute() would free one page
+                self._empty_log(driver)
+                before = left
 
     def check(self, *tables: str) -> list[str]:
         """What SQLite finds damaged in some tables; none: in the whole file."""

@@ -51,8 +51,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TIDIED_AT_ONCE = 16
-"""Times that a write deletes some of what no place names any more."""
+TIDIED_AT_ONCE = 256
+"""Rows that no place names any more that a write deletes behind itself, about."""
 
 MOST_RECENT = 1024
 """Places of a map that are remembered after they were read …"""
@@ -454,10 +454,11 @@ class Map(LedgerMap):
             fresh: also what died a moment ago, if it is known that nobody needs it.
         """
         try:
-            known = fresh and self._is_unread()
-            for _ in range(TIDIED_AT_ONCE):
-                if not self._tidy(known):
-                    break
+            known, done = fresh and self._is_unread(), 0
+            while done < TIDIED_AT_ONCE and (cleared := self._tidy(known)):
+                done += cleared
+            if done:
+                self.database.give_back()
         except PlacerecError as error:
             log.warning("Map %s: %s", self.record.id, error)
 
