@@ -30,6 +30,7 @@ from core.errors import (
     StorageFull,
     UnknownMap,
 )
+from core.ledger.maps.record import MapState
 from core.maps.pagination import Listing, decode_name, one_more, page_of
 from core.maps.records import MapRecord, VerifyReport
 from core.maps.status import Progress, no_progress
@@ -178,7 +179,7 @@ class Directory(Store):
                 create(unfinished, made)
                 os.rename(unfinished, folder)
                 sync_folder(self._folder)
-                found = self._read(folder)
+                found = self._found(folder, MapState(1, made))
             except BaseException:
                 shutil.rmtree(unfinished, ignore_errors=True)
                 shutil.rmtree(folder, ignore_errors=True)
@@ -194,13 +195,18 @@ class Directory(Store):
             Damage: it is not a map, or another one than its folder says.
             StorageFull, StorageFailure: the disk refuses.
         """
-        file = MapFile(folder, self._open_files)
+        file = MapFile(folder, OpenFiles(1))
         try:
             state = file.state()
             if state.record.id != folder.name.removeprefix(UNLISTED) and not folder.name.startswith(_HALF_MADE):
                 raise Damage(f"{FILE}: it belongs to the map {state.record.id!r}")
         finally:
             file.rest()
+        return self._found(folder, state)
+
+    def _found(self, folder: Path, state: MapState) -> Map:
+        """The map in a folder, which was found in a state."""
+        file = MapFile(folder, self._open_files)
         made = Map(file, state, self._cache, self.milvus, self._rows_per_segment)
         file.rested = made.rest
         return made
@@ -218,28 +224,32 @@ class Directory(Store):
             self._expect_free(made.id)
             self._reserved.add(made.id)
         unfinished = self._folder / f"{_HALF_MADE}{made.id}-{secrets.token_hex(4)}"
+        building: Map | None = None
         try:
             with disk_errors(f"make map {made.id!r}"):
                 create(unfinished, made)
-                building = self._read(unfinished)
+                building = self._found(unfinished, MapState(1, made))
                 yield building
                 if damage := building.database.check():
                     raise StorageFailure(f"The disk did not keep what was written: {damage[0]}.")
+                state = building.latest()
                 self._end(building)
+                sync_folder(unfinished)  # the end of SQLite's log
                 with self._making:
                     self._expect_open()
                     folder = self._folder / made.id
                     os.rename(unfinished, folder)
                     try:
-                        found = self._read(folder)
                         sync_folder(self._folder)
                     except BaseException:
                         os.rename(folder, unfinished)
                         raise
-                    self._maps[made.id] = found
+                    self._maps[made.id] = self._found(folder, state)
         except Damage as damage:
             raise StorageFailure(f"The disk did not keep what was written: {damage}.") from damage
         finally:
+            if building is not None:
+                self._end(building)
             self._reserved.discard(made.id)
             shutil.rmtree(unfinished, ignore_errors=True)
 
@@ -257,14 +267,16 @@ class Directory(Store):
             if made is None:
                 raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
             unfinished, folder = self._folder / f"{UNLISTED}{map_id}", self._folder / map_id
+            state = made.latest()
             self._end(made)
             try:
+                sync_folder(unfinished)  # the end of SQLite's log
                 os.rename(unfinished, folder)
             except OSError:
-                self._unlisted[map_id] = self._read(unfinished)
+                self._unlisted[map_id] = self._found(unfinished, state)
                 raise
             del self._unlisted[map_id]
-            listed = self._maps[map_id] = self._read(folder)
+            listed = self._maps[map_id] = self._found(folder, state)
             sync_folder(self._folder)
         return listed
 

@@ -240,7 +240,7 @@ class MapFile:
                 found_no_room = isinstance(error, sqlite3.Error) and is_full(error)
                 self._doubtful |= committing and not found_no_room
                 if self._doubtful or found_no_room:  # the log takes up room, too
-                    with suppress(OSError, sqlite3.Error):
+                    with suppress(OSError, sqlite3.Error, MapBusy):
                         self._empty_log(driver)
                 raise
 
@@ -251,11 +251,12 @@ class MapFile:
         reached the disk, from where SQLite would replay them after a crash; so no write begins before the log is empty.
 
         Raises:
-            OSError, sqlite3.Error: the log could not be emptied.
+            MapBusy: readers keep the log from being emptied.
+            OSError, sqlite3.Error: it could not be emptied.
         """
         (busy, _, _) = driver.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
         if busy:
-            raise sqlite3.OperationalError("readers keep the log from being emptied")
+            raise MapBusy("The map is being read, by an export or a check: try again later.")
         sync_file(self.path.with_name(f"{FILE}-wal"))  # or a power cut could restore its former content
         self._doubtful = False
 
@@ -323,10 +324,7 @@ class MapFile:
             before = self.path.stat().st_size
             rewrite(self._writer, self.folder)
             self._writer.execute("PRAGMA temp_store = MEMORY")
-            try:
-                self._empty_log(self._writer)
-            except sqlite3.OperationalError as error:
-                raise MapBusy("The map is being read, by an export or a check: erase it later.") from error
+            self._empty_log(self._writer)
             return max(0, before - self.path.stat().st_size)
 
     def give_back(self) -> None:
