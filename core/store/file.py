@@ -154,6 +154,7 @@ class MapFile:
             driver = sqlite_file.connect(self.path, settings=_SETTINGS)
             try:
                 prepare(driver, str(self.path))
+                sync_folder(self.folder)  # the name of SQLite's log
             except BaseException:
                 driver.close()
                 raise
@@ -223,7 +224,6 @@ class MapFile:
             if self._writer is None:
                 self._writer = self._connected()
                 sqlite_file.expect_writable(self._writer)
-                sync_folder(self.folder)  # the name of SQLite's log
             driver, committing = self._writer, False
             if self._doubtful:
                 self._empty_log(driver)
