@@ -154,7 +154,8 @@ class MapFile:
             driver = sqlite_file.connect(self.path, settings=_SETTINGS)
             try:
                 prepare(driver, str(self.path))
-                sync_folder(self.folder)  # the name of SQLite's log
+                with suppress(OSError):  # the name of SQLite's log, of which the first write makes sure
+                    sync_folder(self.folder)
             except BaseException:
                 driver.close()
                 raise
@@ -224,6 +225,7 @@ class MapFile:
             if self._writer is None:
                 self._writer = self._connected()
                 sqlite_file.expect_writable(self._writer)
+                sync_folder(self.folder)
             driver, committing = self._writer, False
             if self._doubtful:
                 self._empty_log(driver)
