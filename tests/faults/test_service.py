@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.store import Directory
 from tests.core.store.frames import frame
-from tests.faults.damage import flip
 from tests.faults.injection import attached
+from tests.service.damage import damage
 from tests.service.places.test_durability import answers
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -179,8 +179,13 @@ def test_no_file_descriptor_is_left(server: Server, lab: str) -> None:
     process, (soft, hard) = server.process.pid, resource.prlimit(server.process.pid, resource.RLIMIT_NOFILE)
     resource.prlimit(process, resource.RLIMIT_NOFILE, (min(open_files(server), soft), hard))
     try:
-        check_refused(server, 503, "too-many-open-files")
-        assert 1 <= int(server.enrol("lab", "refused", jpeg(7)).headers["Retry-After"]) <= 3
+        refused = server.client.post("/v1/maps", json={"id": "refused"})
+        assert_problem(refused, 503, "too-many-open-files")
+        assert 1 <= int(refused.headers["Retry-After"]) <= 3
+        assert server.enrol("lab", "open", jpeg(7)).status_code == 201, "the files of this map are open"
+        assert server.query("lab", jpeg(7))["matches"][0]["place"]["id"] == "open"
+        assert server.query("hall", jpeg(50))["matches"][0]["place"]["id"] == "h0"
+        assert server.client.get("/livez").status_code == 200
     finally:
         resource.prlimit(process, resource.RLIMIT_NOFILE, (soft, hard))
     check_recovered(server)
@@ -242,8 +247,7 @@ def prepare(data: Path, models: Path) -> None:
         made = atlas.create(name, encoder.identity, encoder.dimension, local_shape=encoder.local_shape)
         made.enrol([frame("p0", dimension=encoder.dimension, local_shape=encoder.local_shape)])
     atlas.close()
-    segment = data / "maps" / "damaged" / "descriptors-000001.seg"
-    flip(segment, segment.stat().st_size - 100, bit=2)
+    damage(data, "damaged")
     models.mkdir()
     (models / "broken.encoder.safetensors").write_bytes(b"\xff" * 4096)
     for name, content in DAMAGED_FILES.items():
@@ -267,7 +271,7 @@ def test_damaged_files_at_the_start(server: Server) -> None:
     assert_problem(client.put("/v1/maps/damaged/places/p1", content=jpeg(0), headers=headers), 503, "map-quarantined")
     report: dict[str, Any] = client.post("/v1/maps/damaged/verify").json()
     assert not report["ok"]
-    assert any("descriptors-000001.seg: row 0" in problem for problem in report["problems"])
+    assert any("'p0' has descriptors that do not match their checksum" in problem for problem in report["problems"])
     assert client.post("/v1/maps/sound/verify").json()["ok"]
     assert client.get("/v1/jobs").status_code == 200
     assert client.post("/v1/maps/sound/sessions", json={}).status_code == 201
