@@ -196,12 +196,14 @@ def test_a_data_directory_that_disappears_for_a_while(server: Server, lab: str) 
     away = server.data_dir.with_name("away")
     server.data_dir.rename(away)
     try:
-        assert_problem(server.enrol("lab", "refused", jpeg(7)), 500, "storage-failure")
+        assert_problem(server.client.post("/v1/maps", json={"id": "refused"}), 500, "storage-failure")
+        assert server.enrol("lab", "open", jpeg(7)).status_code == 201, "it is written to the file that is away"
         assert server.query("lab", jpeg(1))["matches"][0]["place"]["id"] == "p1"
         assert "disk" in wait_for_readiness(server, 503).json()["detail"]
     finally:
         away.rename(server.data_dir)
     check_recovered(server)
+    assert "open" in server.places("lab")
 
 
 @pytest.mark.thorough

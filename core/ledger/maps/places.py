@@ -661,9 +661,7 @@ def rows_with(
 def stale_tokens(connection: MapConnection, limit: int = 10) -> list[str]:
     """Where the index of metadata does not match the places; :func:`rebuild_tokens` repairs it."""
     stored = set(connection.execute(_TOKENS))
-    wanted = {
-        (row, token) for row, metadata in connection.execute(_METADATA) for token in _tokens(json.loads(metadata))
-    }
+    wanted = {(row, token) for row, metadata in connection.execute(_METADATA) for token in _tokens(_read(metadata))}
     wrong = sorted(stored ^ wanted)
     return [f"row {row} is not indexed correctly by its metadata" for row, _ in wrong[:limit]]
 
@@ -672,4 +670,11 @@ def rebuild_tokens(connection: MapConnection) -> None:
     """Make the index of metadata again, within a transaction."""
     connection.execute(_DELETE_TOKENS)
     for row, metadata in connection.execute(_METADATA):
-        _put_tokens(connection, row, _tokens(json.loads(metadata)))
+        _put_tokens(connection, row, _tokens(_read(metadata)))
+
+
+def _read(metadata: str) -> dict[str, Any]:
+    read = json.loads(metadata)
+    if not isinstance(read, dict):
+        raise ValueError("the metadata of a place is no JSON object")
+    return read
