@@ -33,7 +33,7 @@ CLEARED_AT_ONCE = 16
 """Rows that are deleted with one COMMIT, whose log needs as much room as they had."""
 
 ERASED = 2
-"""Of the column ``cleared``: nothing is left on the disk."""
+"""The value of the column ``cleared`` of rows of which nothing is left on the disk."""
 
 _TABLES: dict[Kind, Table] = {"descriptors": DESCRIPTORS, "locals": LOCALS, "codes": CODES}
 _SUM_BYTES = 4

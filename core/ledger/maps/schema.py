@@ -218,4 +218,4 @@ _UNCOMPRESSED = [
 ]
 
 TABLES = Tables("maps", 14, METADATA, APPLICATION_ID, more={"sqlite": _MORE, "postgresql": _UNCOMPRESSED})
-"""Of maps: of one in an SQLite file, of all in PostgreSQL."""
+"""The tables of maps: of one in an SQLite file, of all in PostgreSQL."""
