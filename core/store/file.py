@@ -319,15 +319,16 @@ class MapFile:
 
         This takes as much room on the disk again as the file has.
         """
-        with self._lock, self.writing():
-            pass  # opens the file, and makes sure of its log
-        with self._lock, self._used(), disk_errors(f"erase deleted places of map {self.folder.name!r}", FILE):
-            assert self._writer is not None
-            before = self.path.stat().st_size
-            rewrite(self._writer, self.folder)
-            self._writer.execute("PRAGMA temp_store = MEMORY")
-            self._empty_log(self._writer)
-            return max(0, before - self.path.stat().st_size)
+        with self._lock:  # nobody closes the file in between
+            with self.writing():
+                pass  # opens the file, and makes sure of its log
+            with self._used(), disk_errors(f"erase deleted places of map {self.folder.name!r}", FILE):
+                assert self._writer is not None
+                before = self.path.stat().st_size
+                rewrite(self._writer, self.folder)
+                self._writer.execute("PRAGMA temp_store = MEMORY")
+                self._empty_log(self._writer)
+                return max(0, before - self.path.stat().st_size)
 
     def give_back(self) -> None:
         """Make the file smaller by what was deleted from it, and empty the log, where the disk has little room left."""

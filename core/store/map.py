@@ -132,7 +132,7 @@ class Map(LedgerMap):
 
     @property
     def number(self) -> int:
-        """Of the map; in one database never used for another one, also of the same id."""
+        """The number of the map, which no other map of the database ever has, also of the same id."""
         return self._state.number
 
     @property
@@ -301,15 +301,14 @@ class Map(LedgerMap):
         """
         if (held := self._followed.held) is None:
             return super().keypoints_at(rows)
-        keys = {int(row): (held.source.generation, "keypoints", int(row)) for row in rows}
-        cached = self._cache.get(list(keys.values()))
-        found = {row: keypoints_of(cached[key]) for row, key in keys.items() if key in cached}
-        if missing := [row for row in keys if row not in found]:
+
+        def read(missing: list[int]) -> dict[int, bytes]:
             with self._glancing() as connection:
-                read = frames.keypoints_at(connection, missing)
-            self._cache.put({keys[row]: one.record() for row, one in read.items()})
-            found |= read
-        return [found.get(int(row)) for row in rows]
+                return {row: one.record() for row, one in frames.keypoints_at(connection, missing).items()}
+
+        wanted = [int(row) for row in rows]
+        found = self._cache.read((held.source.generation, "keypoints"), wanted, read)
+        return [keypoints_of(found[row]) if row in found else None for row in wanted]
 
     # How it is stored
 

@@ -54,6 +54,24 @@ class RowCache:
             self.misses += len(keys) - len(found)
         return found
 
+    def read(
+        self, of: tuple[Hashable, ...], rows: Sequence[int], missing: Callable[[list[int]], Mapping[int, bytes]]
+    ) -> dict[int, bytes]:
+        """Values by row, from the cache or else read; rows that have none are left out.
+
+        Args:
+            of: the part of the keys before the row, which names what is read.
+            missing: reads the values of rows that the cache lacks.
+        """
+        keys = {row: (*of, row) for row in rows}
+        cached = self.get(list(keys.values()))
+        found = {row: cached[key] for row, key in keys.items() if key in cached}
+        if lacking := [row for row in keys if row not in found]:
+            read = missing(lacking)
+            self.put({keys[row]: value for row, value in read.items()})
+            found |= read
+        return found
+
     def put(self, values: Mapping[Hashable, bytes]) -> None:
         """Keep values, and drop others for them."""
         with self._lock:
@@ -110,14 +128,12 @@ class Rows:
             UnknownPlace: the place of a row was deleted a while ago.
         """
         wanted = [int(row) for row in rows]
-        keys = {row: (self.generation, kind, row) for row in wanted}
-        cached = self._cache.get(list(keys.values()))
-        found = {row: cached[key] for row, key in keys.items() if key in cached}
-        if missing := [row for row in keys if row not in found]:
+
+        def read(missing: list[int]) -> dict[int, bytes]:
             with self._glancing() as connection:
-                read = stored_rows.at(connection, kind, missing)
-            self._cache.put({keys[row]: value for row, value in read.items()})
-            found |= read
+                return stored_rows.at(connection, kind, missing)
+
+        found = self._cache.read((self.generation, kind), wanted, read)
         try:
             return [found[row] for row in wanted]
         except KeyError:

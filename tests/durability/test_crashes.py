@@ -20,7 +20,7 @@ from tests.syscalls import strace
 
 SEED = 1
 POINTS_SEED = 783
-"""Of a run that makes, imports, publishes, deletes, fills, empties, erases, closes and opens maps."""
+"""The seed of a run that makes, imports, publishes, deletes, fills, empties, erases, closes and opens maps."""
 
 needs_strace = pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
 

@@ -1,4 +1,4 @@
-"""Of a data directory's maps only a number are open together; any of them is used as if it were."""
+"""Only a number of the maps of a data directory are open together, and each is used as if it were open."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ PLACES = 10
 
 @pytest.fixture
 def folder(directory: Path) -> Path:
-    """Of a map of ten places, closed; beside it a map that must always serve."""
+    """The folder of a closed map of ten places; beside it lies a map that must always serve."""
     atlas = Directory(directory, rows_per_segment=4)
     atlas.create("hall", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("h")])
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol(
